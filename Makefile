@@ -1,0 +1,55 @@
+# make run | test | slow | lint | bench | wheel | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
+
+PYTHON := .venv/bin/python
+READY := .venv/.ready
+OUT ?= runs/$(shell date +%Y%m%d-%H%M%S)
+WORKERS ?= 2
+ARGS ?=
+# One thread a process: the tests run in several, and simulation gains nothing from more.
+ONE_THREAD := OMP_NUM_THREADS=1
+
+.PHONY: run test slow lint bench wheel requirements environment clean
+
+run: $(READY)
+	$(PYTHON) -m osel_sim.run --task pick_place --counterfactual --video 3 --out $(OUT) $(ARGS)
+
+test: $(READY)
+	$(ONE_THREAD) $(PYTHON) -m pytest -m "not slow" -n $(WORKERS) $(ARGS)
+
+slow: $(READY)
+	$(ONE_THREAD) $(PYTHON) -m pytest -m slow $(ARGS)
+
+lint: $(READY)
+	.venv/bin/ruff check .
+	.venv/bin/ruff format --check .
+	.venv/bin/mypy
+
+bench: $(READY)
+	$(PYTHON) benchmarks/simulation.py $(ARGS)
+
+wheel: $(READY)
+	$(PYTHON) -m build --no-isolation
+
+# Compiles the pinned packages again. What is pinned stays as it is where it still fits; ARGS=--upgrade takes the newest.
+requirements: $(READY)
+	.venv/bin/uv pip compile --group dev pyproject.toml --quiet --no-annotate --no-header --no-emit-index-url --universal --python-version 3.12 \
+		--output-file requirements.txt $(ARGS)
+
+environment: $(READY)
+
+# requirements.txt holds the whole closure, hence --no-deps: nothing is resolved a second time.
+$(READY): requirements.txt pyproject.toml
+	@python=; for candidate in python3.12 python3.13 python3; do \
+		if $$candidate -c 'import sys, venv; sys.exit(not (3, 12) <= sys.version_info[:2] < (3, 14))' 2>/dev/null; then python=$$candidate; break; fi; \
+	done; \
+	if [ -z "$$python" ]; then echo "error: Python 3.12 or 3.13 with its venv module is needed (Debian, Ubuntu: apt-get install python3.12-venv)" >&2; exit 2; fi; \
+	echo "setting up .venv with $$($$python --version)"; \
+	[ -x $(PYTHON) ] || $$python -m venv .venv
+	$(PYTHON) -m pip install --quiet --disable-pip-version-check "$$(grep '^uv==' requirements.txt)"
+	.venv/bin/uv pip install --quiet --compile-bytecode --python $(PYTHON) --no-deps -r requirements.txt
+	.venv/bin/uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
+	@touch $@
+
+clean:
+	rm -rf .venv build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""Encoders: an instance's images and instruction as one vector, and the cache of such vectors."""

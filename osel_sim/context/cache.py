@@ -1,0 +1,121 @@
+"""Contexts on disk: `contexts.npz` beside a journal or rollout log, keyed by encoder and instance."""
+
+import os
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from osel_sim.context.encoder import Context, Encoder, Image
+from osel_sim.errors import DataError, UsageError
+
+FILE = "contexts.npz"
+
+
+class ContextCache:
+    """Contexts of any number of encoders in one `contexts.npz`.
+
+    The file holds for each encoder `<identity>|instances` (N,) unicode, sorted, and `<identity>|contexts` (N, d) float32. It is replaced
+    whole and atomically, so a reader or a killed run always finds a complete one, and the same contents are the same bytes.
+    One process writes; workers hand it their contexts.
+
+    Args:
+        folder: where `contexts.npz` lies or will lie.
+        autosave: write the file whenever that many new contexts came in (0: only on `save`).
+
+    Raises:
+        DataError: the file that is there cannot be read or has another form.
+    """
+
+    def __init__(self, folder: Path, autosave: int = 100) -> None:
+        self.file = folder / FILE
+        self._autosave, self._unsaved = autosave, 0
+        self._contexts: dict[str, dict[str, Context]] = _read(self.file) if self.file.exists() else {}
+
+    def encoders(self) -> list[str]:
+        """Identities of the encoders that have contexts here."""
+        return sorted(self._contexts)
+
+    def get(self, encoder: str, instance: str) -> Context | None:
+        """The context (d,) of an instance, or None. `encoder` is an identity, or a name where only one identity here has it."""
+        return self._contexts.get(self._identity(encoder), {}).get(instance)
+
+    def table(self, encoder: str, instances: Sequence[str]) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+        """Contexts (N, d) of these instances, in their order.
+
+        Raises:
+            DataError: an encoder or instance has no context here.
+        """
+        known = self._contexts.get(self._identity(encoder))
+        if known is None:
+            raise DataError(f"{self.file}: no contexts of encoder {encoder!r}, only of: {', '.join(self.encoders()) or 'none'}")
+        missing = [instance for instance in instances if instance not in known]
+        if missing:
+            raise DataError(f"{self.file}: encoder {encoder!r} has no context of {len(missing)} instances, the first of them {missing[0]!r}")
+        return np.stack([known[instance] for instance in instances])
+
+    def put(self, encoder: str, instance: str, context: Context) -> None:
+        """Add a context; `encoder` is an identity."""
+        if context.dtype != np.float32 or context.ndim != 1 or not np.isfinite(context).all():
+            raise UsageError(f"a context must be finite float32 (d,), got {context.dtype} {context.shape}")
+        known = self._contexts.setdefault(encoder, {})
+        if known and len(next(iter(known.values()))) != len(context):
+            raise UsageError(f"contexts of encoder {encoder!r} have length {len(next(iter(known.values())))}, got {len(context)}")
+        known[instance] = context
+        self._unsaved += 1
+        if self._autosave and self._unsaved >= self._autosave:
+            self.save()
+
+    def encode(self, encoder: Encoder, instance: str, images: Callable[[], Sequence[Image]], instruction: str) -> Context:
+        """The context from here, else encoded now and kept. `images` is called only if needed, so nothing is rendered for a known instance."""
+        context = self.get(encoder.identity, instance)
+        if context is None:
+            context = encoder.encode(images(), instruction)
+            self.put(encoder.identity, instance, context)
+        return context
+
+    def save(self) -> None:
+        """Write the file if something new came in."""
+        if not self._unsaved:
+            return
+        arrays: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]] = {}
+        for encoder, known in sorted(self._contexts.items()):
+            instances = sorted(known)
+            arrays[f"{encoder}|instances"] = np.array(instances, dtype=np.str_)
+            arrays[f"{encoder}|contexts"] = np.stack([known[instance] for instance in instances])
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        temporary = self.file.with_suffix(".tmp")
+        with temporary.open("wb") as handle:
+            np.savez(handle, allow_pickle=False, **arrays)
+            handle.flush()
+            os.fsync(handle.fileno())
+        temporary.replace(self.file)
+        self._unsaved = 0
+
+    def _identity(self, encoder: str) -> str:
+        if encoder in self._contexts:
+            return encoder
+        matches = [identity for identity in self._contexts if identity.partition("@")[0] == encoder]
+        if len(matches) > 1:
+            raise DataError(f"{self.file}: several versions of encoder {encoder!r}: {', '.join(sorted(matches))}; name one of them")
+        return matches[0] if matches else encoder
+
+
+def _read(file: Path) -> dict[str, dict[str, Context]]:
+    contexts: dict[str, dict[str, Context]] = {}
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            for key in archive.files:
+                encoder, _, part = key.rpartition("|")
+                if part != "instances":
+                    continue
+                instances, table = archive[key], archive[f"{encoder}|contexts"]
+                if instances.dtype.kind != "U" or table.dtype != np.float32 or table.ndim != 2 or len(instances) != len(table):
+                    raise DataError(
+                        f"{file}: {encoder}: expected (N,) unicode and (N, d) float32, got {instances.dtype} and {table.dtype} {table.shape}"
+                    )
+                contexts[encoder] = {str(instance): row for instance, row in zip(instances, table, strict=True)}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(f"{file}: not a file of contexts ({' '.join(str(error).split())})") from None
+    return contexts

@@ -1,0 +1,52 @@
+"""Typed errors. Every one of them is the user's to read: commands print its message as one line and exit with `exit_code`."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class OselError(Exception):
+    """Base of all errors this package raises on purpose."""
+
+    exit_code = 2
+
+
+class UsageError(OselError):
+    """A command or function was given a value it cannot work with."""
+
+
+class UnknownNameError(UsageError):
+    """A task, policy, encoder, selector ... of that name does not exist."""
+
+    def __init__(self, what: str, name: str, known: Iterable[str], where: str = "") -> None:
+        known = sorted(known)
+        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        listing = f"known: {', '.join(known) or 'none'}" + (f" ({where})" if where else "")
+        super().__init__(f"unknown {what} {name!r}: {hint}{listing}")
+
+
+class ContentError(OselError):
+    """A task or policy file is wrong. The message names the file, the key and what would be right."""
+
+    def __init__(self, file: object, key: str, problem: str) -> None:
+        super().__init__(f"{file}: {key}: {problem}")
+
+
+class CheckpointError(OselError):
+    """A checkpoint is missing, unreadable or does not fit its policy file."""
+
+
+class PolicyError(OselError):
+    """A policy's answer does not have the promised form."""
+
+
+class DisplayError(OselError):
+    """No headless OpenGL backend works."""
+
+
+class RemoteError(OselError):
+    """A policy server cannot be started or reached, or broke the protocol."""
+
+
+class DataError(OselError):
+    """A journal, rollout log or dataset cannot be read or does not have the promised form."""

@@ -1,0 +1,151 @@
+"""The journal of a live run: `episodes.jsonl`, one decision a line, on disk before the next decision starts.
+
+A process killed in the middle of a write leaves at most one torn last line, which is dropped when the journal is opened again. Keys stand in the
+order of the dataclass and floats in Python's shortest exact form, so that equal decisions are equal bytes.
+"""
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from osel_sim.errors import DataError
+from osel_sim.formats.outcome import Outcome, Seconds
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One decision and what came of it.
+
+    Attributes:
+        index: 0, 1, 2 ... without gaps.
+        propensities: probability of each policy when this one was chosen.
+        reward: None when the outcome is an error; nothing is learnt from it then.
+        Others: of the instance and of `Outcome`.
+    """
+
+    index: int
+    task: str
+    seed: int
+    level: int
+    axes: str | None
+    split: str
+    instruction: str
+    phrasing: str
+    target: str
+    container: str
+    policy: str
+    propensities: dict[str, float]
+    success: bool
+    subgoals: float
+    steps: int
+    seconds: Seconds
+    calls: int
+    actions: int
+    price: float
+    reward: float | None
+    fallback: str | None
+    error: str | None
+
+    @property
+    def outcome(self) -> Outcome:
+        """What came of it, without what it was about."""
+        return Outcome(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Outcome)})
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Decision":
+        """Raises TypeError or KeyError if a field is missing or unknown."""
+        return cls(**{**data, "seconds": Seconds(**data["seconds"])})
+
+
+def to_line(data: dict[str, Any]) -> str:
+    """One line of JSON, keys in the order given, floats exact.
+
+    Raises:
+        ValueError: a NaN or infinity, which JSON does not have.
+    """
+    return json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(", ", ": ")) + "\n"
+
+
+class Lines:
+    """An append-only file of JSON lines, each flushed to disk before `append` returns.
+
+    Args:
+        keep: drop all lines after the first so many (None: keep all whole ones).
+    """
+
+    def __init__(self, file: Path, keep: int | None = None) -> None:
+        self.file = file
+        self.rows = list(read_lines(file))[:keep]
+        good = sum(len(raw) for _, raw in self.rows)
+        self._handle = file.open("r+b" if file.exists() else "w+b")
+        self._handle.truncate(good)  # the torn line of a killed process, and what lies beyond `keep`
+        self._handle.seek(good)
+        _sync_folder(file.parent)
+
+    def append(self, data: dict[str, Any]) -> None:
+        """Write one line and wait until it is on disk."""
+        self._handle.write(to_line(data).encode())
+        self._handle.flush()
+        os.fsync(self._handle.fileno())
+
+    def close(self) -> None:
+        """Close the file."""
+        self._handle.close()
+
+
+def read_lines(file: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
+    """Each whole line of a JSON lines file with its bytes; a torn last line is passed over, a broken one elsewhere refused.
+
+    Raises:
+        DataError: naming file and line.
+    """
+    raw = file.read_bytes() if file.exists() else b""
+    for number, line in enumerate(raw.splitlines(keepends=True), 1):
+        if not line.endswith(b"\n"):
+            return
+        try:
+            data = json.loads(line)
+        except ValueError as error:
+            raise DataError(f"{file}, line {number}: not JSON ({error})") from None
+        if not isinstance(data, dict):
+            raise DataError(f"{file}, line {number}: expected an object, got {type(data).__name__}")
+        yield data, line
+
+
+def to_decision(data: dict[str, Any], index: int, file: Path) -> Decision:
+    """Check one line.
+
+    Raises:
+        DataError: naming file and line.
+    """
+    try:
+        decision = Decision.from_dict(data)
+    except (TypeError, KeyError) as error:
+        raise DataError(f"{file}, line {index + 1}: not a decision ({error})") from None
+    if decision.index != index:
+        raise DataError(f"{file}, line {index + 1}: index must be {index}, got {decision.index}")
+    return decision
+
+
+def read_journal(file: Path) -> list[Decision]:
+    """All whole decisions of a journal.
+
+    Raises:
+        DataError: the file is missing or not a journal.
+    """
+    if not file.is_file():
+        raise DataError(f"{file} does not exist; a run writes it as episodes.jsonl")
+    return [to_decision(data, index, file) for index, (data, _) in enumerate(read_lines(file))]
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a new file's name survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,151 @@
+"""The rollout log: outcomes of every policy on the same instances, with repeats: `rollouts.parquet`.
+
+The contexts lie beside it in `contexts.npz` (osel_sim.context.cache). The file is a function of its content alone: no time stamps, rows in the order
+instance, policy, repeat. Logs from elsewhere (osel_sim.ingest) fit the same columns; those that make no sense there are null.
+
+Version 2 of the schema has two columns more. `score`: what was measured where success is a matter of degree, such as minus an action MSE; it is null
+in what this suite records. `axes`: those perturbed beyond `level`, such as `camera=2`. Logs of version 1 are read as before, with both null.
+"""
+
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from osel_sim.errors import DataError
+from osel_sim.formats.outcome import Outcome, Seconds
+
+if TYPE_CHECKING:
+    import pyarrow
+
+SCHEMA_VERSION = 2
+_COLUMNS_ADDED = {2: ("score", "axes")}
+"""Columns that came with a version; logs of an earlier one are read without them."""
+ROLLOUTS = "rollouts.parquet"
+_PREFIX = b"osel_sim."
+
+
+@dataclass(frozen=True)
+class Row:
+    """One episode: what it was about, who drove, what came of it.
+
+    Attributes:
+        instance: key of the instance, the same for all its rows; `contexts.npz` has it too.
+        phrasing: which wording of the task's language the instruction uses.
+        axes: the axes perturbed beyond `level`, as `camera=2,light=1`; None where there are none.
+        target, container: the object asked for and where it goes.
+        upload ... motion: seconds, as in `Outcome`.
+        score: a graded outcome, higher is better, where there is one; None otherwise. `success` is there all the same, such as "score >= 0.5".
+        Others: as in `Outcome`.
+
+    Logs from elsewhere have None where a column makes no sense: no robot, no steps; no price known, no price. Never a made-up number.
+    """
+
+    task: str
+    instance: str
+    seed: int | None
+    level: int | None
+    split: str | None
+    instruction: str | None
+    phrasing: str | None
+    target: str | None
+    container: str | None
+    policy: str
+    repeat: int
+    success: bool
+    subgoals: float | None
+    steps: int | None
+    upload: float | None
+    inference: float | None
+    download: float | None
+    motion: float | None
+    calls: int | None
+    actions: int | None
+    price: float | None
+    fallback: str | None
+    error: str | None
+    score: float | None = None
+    axes: str | None = None
+
+    @property
+    def outcome(self) -> Outcome:
+        """What came of an episode in simulation, without what it was about.
+
+        Raises:
+            DataError: a row from elsewhere that lacks something an episode has.
+        """
+        missing = [name for name in _EPISODE if getattr(self, name) is None]
+        if missing:
+            raise DataError(f"instance {self.instance!r}, policy {self.policy!r} is no episode in simulation: it has no {', '.join(missing)}")
+        own = {field.name: getattr(self, field.name) for field in fields(Outcome) if field.name != "seconds"}
+        return Outcome(seconds=Seconds(*(getattr(self, field.name) for field in fields(Seconds))), **own)
+
+
+_EPISODE = ("subgoals", "steps", "upload", "inference", "download", "motion", "calls", "actions", "price")
+
+
+def schema() -> "pyarrow.Schema":
+    """Columns of `rollouts.parquet` with their types; all but task, instance, policy, repeat and success may be null."""
+    import pyarrow
+
+    kinds = {"str": pyarrow.string(), "int": pyarrow.int64(), "float": pyarrow.float64(), "bool": pyarrow.bool_()}
+    needed = ("task", "instance", "policy", "repeat", "success")
+    return pyarrow.schema(
+        [pyarrow.field(field.name, kinds[_type_name(field.type).removesuffix(" | None")], nullable=field.name not in needed) for field in fields(Row)]
+    )
+
+
+def write_rollouts(folder: Path, rows: Iterable[Row], metadata: dict[str, Any]) -> Path:
+    """Write `rollouts.parquet`, at once or not at all.
+
+    Args:
+        metadata: goes into the file's metadata as JSON, under `osel_sim.<key>`, beside the schema version.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    extra = {**metadata, "schema_version": SCHEMA_VERSION}
+    annotated = schema().with_metadata({_PREFIX + key.encode(): json.dumps(value, sort_keys=True).encode() for key, value in sorted(extra.items())})
+    table = pyarrow.Table.from_pylist([vars(row) for row in rows], schema=annotated)
+    file = folder / ROLLOUTS
+    partial = file.with_suffix(".partial")
+    pyarrow.parquet.write_table(table, partial, compression="zstd")
+    os.replace(partial, file)
+    return file
+
+
+def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
+    """Rows and metadata of a rollout log.
+
+    Raises:
+        DataError: no log there, or one of another form.
+    """
+    import pyarrow
+    import pyarrow.parquet
+
+    file = folder / ROLLOUTS
+    if not file.is_file():
+        raise DataError(f"{file} does not exist; python -m osel_sim.record --out {folder} writes it")
+    try:
+        table = pyarrow.parquet.read_table(file)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise DataError(f"{file} is not a Parquet file ({error})") from None
+    raw = table.schema.metadata or {}
+    try:
+        metadata = {key.removeprefix(_PREFIX).decode(): json.loads(value) for key, value in raw.items() if key.startswith(_PREFIX)}
+    except ValueError as error:
+        raise DataError(f"{file}: its metadata cannot be read ({error})") from None
+    version = metadata.get("schema_version")
+    if not isinstance(version, int) or not 1 <= version <= SCHEMA_VERSION:
+        raise DataError(f"{file}: osel_sim.schema_version must be 1 to {SCHEMA_VERSION}, got {version}")
+    later = {name for since, names in _COLUMNS_ADDED.items() if since > version for name in names}
+    columns = [name for name in schema().names if name not in later]
+    if table.schema.names != columns:
+        raise DataError(f"{file}: columns must be {', '.join(columns)}; got {', '.join(table.schema.names)}")
+    return [Row(**row) for row in table.to_pylist()], metadata
+
+
+def _type_name(kind: object) -> str:
+    return kind.__name__ if isinstance(kind, type) else str(kind)

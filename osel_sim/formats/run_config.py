@@ -1,0 +1,180 @@
+"""`run.json`: everything a live run or a recording depends on, and what it ran with.
+
+The configuration and the GL backend must be equal when a run is resumed. Versions may differ, with a warning: what follows then need not be the bytes
+that an uninterrupted run would have written.
+"""
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from osel_sim import content
+from osel_sim.errors import DataError, UsageError
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.formats.task_file import TaskSpec
+
+SCHEMA_VERSION = 1
+RUN = "run.json"
+LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
+
+
+def environment(gl: str, root: Path) -> dict[str, Any]:
+    """What a run ran with.
+
+    Args:
+        gl: the OpenGL backend in use.
+        root: folder whose git revision counts.
+    """
+    versions = {"python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return {"gl": gl, "versions": versions, "git": git_revision(root), "machine": platform.machine(), "system": platform.system()}
+
+
+def git_revision(root: Path) -> str | None:
+    """Commit of a checkout, with `+changes` if tracked files differ from it; None outside of one."""
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    try:
+        revision = git("rev-parse", "HEAD")
+        return revision + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, or of all files of a folder with their names."""
+    total = hashlib.sha256()
+    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+        if file.is_file():
+            total.update(file.relative_to(path).as_posix().encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return total.hexdigest()
+
+
+def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -> dict[str, str]:
+    """What the files that a run depends on hold: the tasks', the policies', and their checkpoints' where those lie on this machine."""
+    digests = {f"task {task.name}": digest(task.file) for task in tasks}
+    for spec in policies:
+        digests[f"policy {spec.name}"] = digest(spec.file)
+        checkpoint = content.resolve_checkpoint(spec.checkpoint) if spec.checkpoint else None
+        if isinstance(checkpoint, Path):
+            digests[f"checkpoint {spec.name}"] = digest(checkpoint)
+    return digests
+
+
+def check_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:
+    """Refuse an output folder that cannot be used, before anything heavy is loaded.
+
+    Args:
+        configuration: as far as it is known; keys that it lacks are not compared.
+
+    Raises:
+        UsageError: the folder is in use and `resume` is off, there is nothing to resume, or the configuration differs.
+        DataError: its `run.json` cannot be read.
+    """
+    file = folder / RUN
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"--out {folder} is a file; give a folder")
+    if not file.exists():
+        if resume:
+            raise UsageError(f"--resume: there is no run in {folder}; leave --resume out to begin one, or give the folder with --out")
+        check_writable(folder)
+        if folder.exists() and any(item.name != "run.partial" for item in folder.iterdir()):
+            raise UsageError(f"--out {folder} is not empty and holds no {RUN}; give a new folder")
+        return
+    if not resume:
+        raise UsageError(f"--out {folder} is in use; add --resume to go on with what is in it, or give another folder")
+    was = read_json(file).get("configuration", {})
+    _compare(file, {key: was.get(key) for key in configuration}, json.loads(json.dumps(configuration)))
+
+
+def check_writable(folder: Path) -> None:
+    """Whether a folder can be written into, or made.
+
+    Raises:
+        UsageError: it cannot.
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise UsageError(f"--out {folder} cannot be written: {there} is a file")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UsageError(f"--out {folder} cannot be written: no permission to write into {there}")
+
+
+def start_or_resume(folder: Path, configuration: dict[str, Any], ran_with: dict[str, Any], resume: bool) -> list[str]:
+    """Make the output folder with its `run.json`, or check that what is in it is the same run.
+
+    Returns:
+        warnings: what is different in the environment of a resumed run.
+
+    Raises:
+        UsageError: as `check_folder`, or the folder cannot be written, or the GL backend differs.
+        DataError: its `run.json` cannot be read.
+    """
+    check_folder(folder, configuration, resume)
+    file = folder / RUN
+    if not resume:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_json(file, {"schema_version": SCHEMA_VERSION, "configuration": configuration, "environment": ran_with})
+        except OSError as error:
+            raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
+        return []
+    was = read_json(file).get("environment", {})
+    if was.get("gl") != ran_with["gl"]:
+        raise UsageError(f"{file}: it began with the GL backend {was.get('gl')!r}, now it is {ran_with['gl']!r}; set MUJOCO_GL={was.get('gl')}")
+    return [
+        f"{key} was {_flat(was).get(key)!r} at the beginning, now it is {value!r}"
+        for key, value in _flat(ran_with).items()
+        if _flat(was).get(key) != value
+    ]
+
+
+def _compare(file: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
+    was, now = _flat(old), _flat(new)
+    for key in [*now, *(key for key in was if key not in now)]:
+        if was.get(key) != now.get(key):
+            raise UsageError(
+                f"{file}: {key} was {was.get(key)!r} at the beginning, now it is {now.get(key)!r}; resume with the same, or give another --out"
+            )
+
+
+def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested keys joined with dots, so that a difference can be named."""
+    result: dict[str, Any] = {}
+    for key, value in data.items():
+        result.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value})
+    return result
+
+
+def write_json(file: Path, data: dict[str, Any]) -> None:
+    """Indented JSON, at once or not at all."""
+    partial = file.with_suffix(".partial")
+    partial.write_text(json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
+    os.replace(partial, file)
+
+
+def read_json(file: Path) -> dict[str, Any]:
+    """A JSON object.
+
+    Raises:
+        DataError: the file is missing or holds something else.
+    """
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DataError(f"{file} cannot be read as JSON ({error})") from None
+    if not isinstance(data, dict):
+        raise DataError(f"{file}: expected an object, got {type(data).__name__}")
+    return data

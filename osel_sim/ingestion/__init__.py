@@ -1,0 +1,1 @@
+"""Outcome tables of others: how they are read, what their columns mean, and how they become a rollout log."""

@@ -1,0 +1,244 @@
+"""Minus the error of the actions that policies would have taken on the observations of a LeRobotDataset (paper, Open X-Embodiment).
+
+Nothing is tried out: a policy is shown a logged frame and its instruction, and the actions it answers with are set against those logged from that
+frame on. A remote policy pays for its call as in an episode: delays of the network model on the virtual clock, and its price. A call that fails
+(deadline, outage) has no error to measure; nobody takes over.
+"""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim import cli
+from osel_sim.context.encoder import Image
+from osel_sim.episode import Driver, episode_seed
+from osel_sim.errors import DataError, UsageError
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.formats.rollout_log import Row
+from osel_sim.ingestion.write import Instance, file_digest
+from osel_sim.policy.base import ACTION_DIM, STATE_DIM, Observation
+
+IMAGES = "observation.images."
+STATE, ACTION = "observation.state", "action"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is measured.
+
+    Attributes:
+        frames: of each episode, evenly spread from its first on.
+        tolerance: success is an error of so much or less.
+        cameras: camera of the policy files -> column of the dataset, where it is not `observation.images.<camera>`.
+    """
+
+    frames: int = 4
+    tolerance: float = 0.05
+    cameras: Mapping[str, str] = field(default_factory=dict)
+
+    def column(self, camera: str) -> str:
+        """The dataset's column of a camera."""
+        return self.cameras.get(camera, IMAGES + camera)
+
+
+class Dataset:
+    """A LeRobotDataset, checked against what the policies want to see.
+
+    Raises:
+        DataError: it is none, or lacks a camera, the state or the actions of the suite's form.
+    """
+
+    def __init__(self, folder: Path, cameras: Sequence[str], settings: Settings) -> None:
+        self.folder, self._settings, self._cameras = folder, settings, cameras
+        info = folder / "meta" / "info.json"
+        if not info.is_file():
+            raise DataError(f"{folder}: is no LeRobotDataset, it has no meta/info.json")
+        try:
+            from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+            self._data: Any = LeRobotDataset(f"local/{folder.name}", root=folder)
+        except Exception as error:  # datasets, pyarrow, json and the hub client all have their own
+            raise DataError(f"{folder}: cannot be read as a LeRobotDataset ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from None
+        features: dict[str, Any] = self._data.meta.features
+        for name, length in ((STATE, STATE_DIM), (ACTION, ACTION_DIM)):
+            shape = tuple(features[name]["shape"]) if name in features else None
+            if shape != (length,):
+                raise DataError(f"{folder}: {name!r} must have the shape ({length},) that the policies know, got {shape or 'no such column'}")
+        pictures = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
+        for camera in cameras:
+            column = settings.column(camera)
+            if column not in pictures:
+                raise DataError(
+                    f"{folder}: there are no images {column!r} for the policies' camera {camera!r}: {cli.did_you_mean(column, pictures)}"
+                    f"name one of {', '.join(pictures) or 'none'} with --camera {camera}=COLUMN"
+                )
+        self.actions: NDArray[np.float32] = np.asarray(self._data.hf_dataset.with_format("numpy")[ACTION][:], np.float32)
+        self._task = np.asarray(self._data.hf_dataset.with_format("numpy")["task_index"][:], np.int64)
+        self._tasks = {int(index): str(task) for task, index in self._data.meta.tasks["task_index"].items()}
+        if not np.isfinite(self.actions).all():
+            row = int(np.flatnonzero(~np.isfinite(self.actions).all(axis=1))[0])
+            raise DataError(f"{folder}: frame {row}: {ACTION!r} must be finite numbers, got {self.actions[row].tolist()}")
+
+    def episodes(self) -> list[tuple[int, int]]:
+        """First frame of each episode, and the one after its last."""
+        return [(int(row["dataset_from_index"]), int(row["dataset_to_index"])) for row in self._data.meta.episodes]
+
+    def instruction(self, frame: int) -> str:
+        """The task of a frame, in words."""
+        return self._tasks[int(self._task[frame])]
+
+    def observation(self, frame: int) -> Observation:
+        """What the policies see of a frame."""
+        item = self._data[frame]
+        result: Observation = {IMAGES + camera: _image(item[self._settings.column(camera)]) for camera in self._cameras}
+        return {**result, STATE: np.asarray(item[STATE], np.float32), "task": str(item["task"])}
+
+    def images(self, frame: int) -> list[Image]:
+        """The images of a frame."""
+        item = self._data[frame]
+        return [_image(item[self._settings.column(camera)]) for camera in self._cameras]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One logged frame.
+
+    Attributes:
+        frame, end: index of the frame, and of the one after its episode's last.
+    """
+
+    instance: Instance
+    dataset: Dataset
+    frame: int
+    end: int
+
+
+def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings: Settings) -> list[Sample]:
+    """The frames that policies are to be measured on: `settings.frames` of each episode of each dataset.
+
+    Raises:
+        DataError: a dataset is not as the policies want it.
+        UsageError: two datasets have the same name.
+    """
+    cameras = sorted({camera for spec in specs for camera in spec.cameras})
+    for camera in settings.cameras:
+        if camera not in cameras:
+            raise UsageError(f"--camera {camera}: no policy has that camera: {cli.did_you_mean(camera, cameras)}cameras: {', '.join(cameras)}")
+    names = [folder.resolve().name for folder in folders]
+    samples = []
+    for folder, name in zip(folders, names, strict=True):
+        if names.count(name) > 1:
+            raise UsageError(f"two datasets are called {name!r}, and the log needs a name for each")
+        dataset = Dataset(folder, cameras, settings)
+        digest = hashlib.sha256("".join(file_digest(file) for file in sorted(folder.glob("data/**/*.parquet"))).encode()).hexdigest()
+        for episode, (start, end) in enumerate(dataset.episodes()):
+            chosen = np.unique(np.linspace(start, end, settings.frames, endpoint=False).astype(int))
+            for frame in map(int, chosen):
+                key = f"{name}/{episode:06d}/{frame - start:06d}"
+                instance = Instance(key, dataset.instruction(frame), digest, partial(dataset.images, frame))
+                samples.append(Sample(instance, dataset, frame, end))
+    return samples
+
+
+def measure(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Settings) -> tuple[list[Row], dict[str, Any]]:
+    """Ask every policy for its actions on every sample.
+
+    Returns:
+        a row for each sample and policy, and what was measured, for the log's metadata.
+
+    Raises:
+        CheckpointError, RemoteError: a policy cannot be loaded or reached.
+    """
+    from tqdm import tqdm  # type: ignore[import-untyped]
+
+    from osel_sim.runtime.drivers import Drivers
+
+    rows = []
+    with Drivers(specs) as drivers:
+        for sample in tqdm(samples, unit="frame", dynamic_ncols=True):
+            observation = sample.dataset.observation(sample.frame)
+            rows += [measure_one(sample, drivers[spec.name], observation, settings.tolerance) for spec in specs]
+    return rows, {
+        "datasets": sorted({sample.dataset.folder.resolve().name for sample in samples}),
+        "frames": settings.frames,
+        "tolerance": settings.tolerance,
+    }
+
+
+def action_mse(actions: NDArray[np.float32], logged: NDArray[np.float32]) -> float:
+    """Mean squared error (T, 7) over the steps that both have, float64 throughout."""
+    steps = min(len(actions), len(logged))
+    return float(np.mean(np.square(actions[:steps].astype(np.float64) - logged[:steps])))
+
+
+def measure_one(sample: Sample, driver: Driver, observation: Observation, tolerance: float) -> Row:
+    """Ask one policy for its actions on one sample; a call that fails and a policy that crashes are errors, not scores."""
+    spec, key = driver.spec, sample.instance.key
+    driver.caller.reset(sample.instance.text, episode_seed(key, spec.name, 0))
+    pictures = {IMAGES + camera: _resized(observation[IMAGES + camera], spec.image_size) for camera in spec.cameras}
+    seen = {**pictures, STATE: observation[STATE], "task": observation["task"]}
+    error: str | None = None
+    score: float | None = None
+    actions = 0
+    try:
+        call = driver.caller.call(seen)
+    except Exception as problem:  # a crash is never a policy's failure
+        upload = inference = download = megabytes = 0.0
+        error = f"{spec.name}: {type(problem).__name__}: {' '.join(str(problem).split())}"
+    else:
+        upload, inference, download, megabytes = call.upload, call.inference, call.download, call.megabytes
+        if call.actions is None:
+            error = f"{spec.name}: {call.failure}"
+        else:
+            # What would be executed before the next call, as far as the episode goes on.
+            logged = sample.dataset.actions[sample.frame : min(sample.frame + spec.execute, sample.end)]
+            actions = min(len(call.actions), len(logged))
+            score = -action_mse(call.actions, logged)
+    return Row(
+        task=key.partition("/")[0],
+        instance=key,
+        seed=None,
+        level=None,
+        split=None,
+        instruction=sample.instance.text,
+        phrasing=None,
+        target=None,
+        container=None,
+        policy=spec.name,
+        repeat=0,
+        success=score is not None and -score <= tolerance,
+        subgoals=None,
+        steps=None,
+        upload=upload,
+        inference=inference,
+        download=download,
+        motion=None,
+        calls=1,
+        actions=actions,
+        price=spec.price.of(actions, 1, megabytes),
+        fallback=None,
+        error=error,
+        score=score,
+    )
+
+
+def _image(value: Any) -> Image:
+    """LeRobot's float (3, H, W) in [0, 1] as uint8 (H, W, 3)."""
+    pixels = np.asarray(value, np.float32).transpose(1, 2, 0)
+    return np.ascontiguousarray((pixels * 255).round().clip(0, 255).astype(np.uint8))
+
+
+def _resized(image: Image, side: int) -> Image:
+    """The square image that a policy file asks for; one of other proportions is stretched."""
+    import cv2
+
+    if image.shape[:2] == (side, side):
+        return image
+    shrinks = min(image.shape[:2]) >= side
+    return np.asarray(cv2.resize(image, (side, side), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR), np.uint8)

@@ -1,0 +1,259 @@
+"""Rows of an outcome table as rows of the rollout log."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from osel_sim.errors import DataError, UnknownNameError
+from osel_sim.formats.rollout_log import Row
+from osel_sim.ingestion.mapping import Mapping, PolicyColumns, Success, Term, fill
+from osel_sim.ingestion.tables import Record, number, text
+
+_TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0")
+_WAITING = ("upload", "inference", "download")
+_COUNTS: dict[str, Callable[[str], int]] = {"characters": len, "words": lambda value: len(value.split())}
+
+
+@dataclass(frozen=True)
+class Source:
+    """What an instance's context is made from.
+
+    Attributes:
+        images: files, in order.
+        record: where it was read first.
+    """
+
+    key: str
+    task: str
+    text: str
+    images: tuple[Path, ...]
+    record: Record
+
+
+@dataclass(frozen=True)
+class Converted:
+    """A table as a rollout log.
+
+    Attributes:
+        rows: in the order instance, policy, repeat.
+        sources: an entry for each instance, in the order of the table.
+        policies: names in the log, in the order of the mapping or of their appearance.
+        dropped: rows that were left out as duplicates.
+    """
+
+    rows: list[Row]
+    sources: list[Source]
+    policies: list[str]
+    dropped: int
+
+
+def convert(mapping: Mapping, records: Sequence[Record]) -> Converted:
+    """The outcomes that a table holds.
+
+    An empty cell of success means that the policy did not run on the instance: no row comes of it.
+
+    Raises:
+        DataError: a cell, row or policy that is not as the mapping says; names file, row and column.
+    """
+    sources: dict[str, Source] = {}
+    outcomes: dict[tuple[str, str, int], tuple[Row, Record]] = {}
+    keys: dict[tuple[Any, ...], str] = {}
+    counters: dict[str, int] = {}
+    names = {policy.name: None for policy in mapping.policies.values()}
+    dropped = 0
+    for record in records:
+        source, known = _source(mapping, record, sources, keys, counters)
+        if mapping.policy is None:
+            if known and mapping.repeat is None and mapping.duplicates in ("refuse", "drop"):
+                if mapping.duplicates == "refuse":
+                    raise _duplicate(record, sources[source.key].record, f"instance {source.key!r}")
+                dropped += 1
+                continue
+            policies = list(mapping.policies.values())
+        else:
+            policies = [_policy(mapping, record)]
+            names.setdefault(policies[0].name)
+        sources.setdefault(source.key, source)
+        repeat = _repeat(mapping, record)
+        for policy in policies:
+            row = _row(mapping, record, source, policy, repeat or 0)
+            if row is None:
+                continue
+            place = (source.key, policy.name, row.repeat)
+            if place in outcomes and mapping.repeat is None and mapping.duplicates == "repeats":
+                place = (*place[:2], next(count for count in range(1, len(records)) if (*place[:2], count) not in outcomes))
+                row = Row(**{**vars(row), "repeat": place[2]})
+            if place in outcomes:
+                if mapping.duplicates != "drop":
+                    raise _duplicate(record, outcomes[place][1], f"instance {source.key!r}, policy {policy.name!r}, repeat {row.repeat}")
+                dropped += 1
+                continue
+            outcomes[place] = row, record
+    ran = {policy for _, policy, _ in outcomes}
+    for name in names:
+        if name not in ran:
+            raise DataError(f"{records[0].file}: policy {name!r} has no outcome in any row")
+    order = {key: index for index, key in enumerate(sources)}, {name: index for index, name in enumerate(names)}
+    places = sorted(outcomes, key=lambda place: (order[0][place[0]], order[1][place[1]], place[2]))
+    with_outcome = {place[0] for place in places}
+    kept = [source for key, source in sources.items() if key in with_outcome]
+    return Converted([outcomes[place][0] for place in places], kept, list(names), dropped)
+
+
+def _source(
+    mapping: Mapping, record: Record, sources: dict[str, Source], keys: dict[tuple[Any, ...], str], counters: dict[str, int]
+) -> tuple[Source, bool]:
+    """The instance of a row, and whether an earlier row had it."""
+    task = text(record, mapping.group) if mapping.group else mapping.name
+    words = fill(mapping.text, lambda column: text(record, column))
+    images = tuple(record.file.parent / text(record, column) for column in mapping.images)
+    identity = (task, text(record, mapping.key)) if mapping.key else (task, words, images)
+    known = identity in keys
+    if known and not (mapping.duplicates == "keep" and mapping.policy is None):
+        first = sources[keys[identity]]
+        if (first.text, first.images) != (words, images):
+            raise DataError(
+                f"{record.where}: instance {first.key!r} has another text or image here than in row {first.record.number} of {first.record.file}"
+            )
+        return first, True
+    if known and mapping.key:
+        raise _duplicate(record, sources[keys[identity]].record, f"instance {keys[identity]!r}")
+    counters[task] = counters.get(task, 0) + 1
+    key = f"{task}/{identity[1] if mapping.key else format(counters[task], '06d')}"
+    keys[identity] = key
+    return Source(key, task, words, images, record), False
+
+
+def _policy(mapping: Mapping, record: Record) -> PolicyColumns:
+    column = mapping.policy or ""  # only called for long tables
+    name = text(record, column)
+    if name in mapping.policies:
+        return mapping.policies[name]
+    if mapping.default is None:
+        raise record.error(column, str(UnknownNameError("policy", name, mapping.policies, str(mapping.file))))
+    return PolicyColumns(name, mapping.default.success, mapping.default.numbers, mapping.default.error)
+
+
+def _repeat(mapping: Mapping, record: Record) -> int | None:
+    if mapping.repeat is None:
+        return None
+    value = number(record, mapping.repeat)
+    if value is None or value < 0 or value != int(value):
+        raise record.error(mapping.repeat, f"must be an integer of 0 or more, got {record.values[mapping.repeat]!r}")
+    return int(value)
+
+
+def _row(mapping: Mapping, record: Record, source: Source, policy: PolicyColumns, repeat: int) -> Row | None:
+    error = record.values[policy.error] if policy.error is not None else None
+    success = False if error is not None else _success(record, policy.success)
+    if success is None:
+        return None
+    numbers: dict[str, float | None] = {}
+    if error is None:
+        for name, terms in policy.numbers.items():
+            numbers[name] = _number(record, name, terms)
+    if any(name in numbers for name in _WAITING):
+        # The three are parts of one wait: what the table does not tell apart is not waited for twice.
+        numbers = {**dict.fromkeys(_WAITING, 0.0), **numbers}
+    labels = {label: text(record, column) for label, column in mapping.labels.items()}
+    steps = numbers.pop("steps", None)
+    return Row(
+        task=source.task,
+        instance=source.key,
+        seed=None,
+        level=None,
+        split=labels.get("split"),
+        instruction=source.text,
+        phrasing=labels.get("phrasing"),
+        target=labels.get("target"),
+        container=labels.get("container"),
+        policy=policy.name,
+        repeat=repeat,
+        success=success,
+        subgoals=numbers.get("subgoals"),
+        steps=None if steps is None else int(steps),
+        upload=numbers.get("upload"),
+        inference=numbers.get("inference"),
+        download=numbers.get("download"),
+        motion=numbers.get("motion"),
+        calls=None,
+        actions=None,
+        price=numbers.get("price"),
+        fallback=None,
+        error=None if error is None else str(error),
+        score=numbers.get("score"),
+    )
+
+
+def _success(record: Record, success: Success) -> bool | None:
+    """None where the policy did not run."""
+    value = record.values[success.column]
+    if value is None:
+        return None
+    if success.at_least is not None:
+        measured = _ratio(record, success.column, success.divide)
+        return None if measured is None else measured >= success.at_least
+    if success.true:
+        if value in success.true or value in success.false:
+            return value in success.true
+        raise record.error(success.column, f"must be one of {', '.join([*success.true, *success.false])}, got {value!r}")
+    word = str(value).strip().lower()
+    if word in _TRUE or word in _FALSE:
+        return word in _TRUE
+    if word == "nan":
+        raise record.error(success.column, "is NaN; leave it empty where the policy did not run")
+    hint = "; a graded outcome is a score, and its success a threshold: success = { column = ..., at_least = ... }" if _is_number(value) else ""
+    raise record.error(success.column, f"must be true or false (or 1 or 0), got {value!r}{hint}")
+
+
+def _number(record: Record, name: str, terms: Sequence[Term]) -> float:
+    total = math.fsum(_term(record, term) for term in terms)
+    column = next((term.column for term in terms if term.column is not None), name)
+    low, high = (-math.inf, math.inf) if name == "score" else (0.0, 1.0) if name == "subgoals" else (0.0, math.inf)
+    if not low <= total <= high:
+        raise record.error(column, f"{name} must lie in [{low:g}, {high:g}], got {total:g}")
+    if name == "steps" and total != int(total):
+        raise record.error(column, f"steps must be an integer, got {total:g}")
+    return total
+
+
+def _term(record: Record, term: Term) -> float:
+    if term.column is None:
+        return term.offset
+    if term.count in _COUNTS:
+        value: float | None = _COUNTS[term.count](text(record, term.column))
+        if term.divide is not None:
+            value = _divided(record, float(value or 0), term.divide)
+    else:
+        value = _ratio(record, term.column, term.divide)
+    if value is None:
+        raise record.error(term.column, "is empty although the policy has an outcome")
+    return term.scale * value + term.offset
+
+
+def _ratio(record: Record, column: str, divide: str | None) -> float | None:
+    value = number(record, column)
+    return value if value is None or divide is None else _divided(record, value, divide)
+
+
+def _divided(record: Record, value: float, divide: str) -> float:
+    by = number(record, divide)
+    if not by:
+        raise record.error(divide, f"must be a number other than 0 to divide by, got {record.values[divide]!r}")
+    return value / by
+
+
+def _duplicate(record: Record, first: Record, what: str) -> DataError:
+    return DataError(
+        f"{record.where}: {what} is in row {first.number} of {first.file} already; remove one, name a column of repeats, "
+        'or say what it means with duplicates = "drop" or "repeats" (in a wide table also "keep")'
+    )
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        return math.isfinite(float(value))
+    except (TypeError, ValueError, OverflowError):
+        return False

@@ -1,0 +1,120 @@
+"""An ingested log on disk: contexts first, resumable; then `ingest.json` and the log itself, at once."""
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from osel_sim.context.encoder import Encoder, Image
+from osel_sim.errors import DataError, UsageError
+from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
+from osel_sim.formats.run_config import read_json, write_json
+
+INGEST = "ingest.json"
+AUTOSAVE = 500
+
+
+@dataclass(frozen=True)
+class Instance:
+    """What an instance's context is made from.
+
+    Attributes:
+        digest: of all that its images depend on; where it or the text differs, so may the context.
+        images: loads them, uint8 (H, W, 3) RGB.
+    """
+
+    key: str
+    text: str
+    digest: str
+    images: Callable[[], Sequence[Image]]
+
+
+def check_out(folder: Path, instances: Iterable[Instance]) -> str:
+    """Refuse an output folder that holds something else, before anything heavy is loaded.
+
+    Returns:
+        a digest of the instances, for `write_log`.
+
+    Raises:
+        UsageError: the folder is in use, by a log or by the contexts of other instances.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"--out {folder} is a file; give a folder")
+    total = hashlib.sha256(json.dumps([(item.key, item.text, item.digest) for item in instances], ensure_ascii=False).encode())
+    inputs = total.hexdigest()
+    file = folder / INGEST
+    if file.exists():
+        if read_json(file).get("instances") != inputs:
+            raise UsageError(f"--out {folder} holds the contexts of other instances, or of other files; give another folder")
+    elif folder.exists() and any(folder.iterdir()):
+        raise UsageError(f"--out {folder} is not empty and holds no {INGEST}; give a new folder")
+    return inputs
+
+
+def write_log(
+    folder: Path, inputs: str, rows: list[Row], instances: Sequence[Instance], load_encoder: Callable[[], Encoder], metadata: dict[str, Any]
+) -> str:
+    """Encode what is not encoded yet, with a progress bar, and write the log. An interrupted one goes on where it was.
+
+    A log that is there already stays, if it is the same: then only contexts of another encoder are added.
+
+    Args:
+        inputs: from `check_out`.
+        metadata: of the log; the encoder is added.
+
+    Returns:
+        the encoder's identity.
+
+    Raises:
+        UsageError: another log is there.
+    """
+    from tqdm import tqdm  # type: ignore[import-untyped]
+
+    from osel_sim.context.cache import ContextCache
+
+    there = (folder / ROLLOUTS).exists()
+    if there and read_rollouts(folder)[0] != rows:
+        raise UsageError(f"--out {folder} holds a log with other outcomes; give another folder")
+    encoder = load_encoder()
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / INGEST, {"instances": inputs})
+    cache = ContextCache(folder, autosave=AUTOSAVE)
+    missing = [item for item in instances if cache.get(encoder.identity, item.key) is None]
+    try:
+        for item in tqdm(
+            missing, initial=len(instances) - len(missing), total=len(instances), unit="context", dynamic_ncols=True, disable=not missing
+        ):
+            cache.encode(encoder, item.key, item.images, item.text)
+    finally:
+        cache.save()
+    if not there:
+        write_rollouts(folder, rows, {**metadata, "encoder": encoder.identity})
+    return encoder.identity
+
+
+def load_image(file: Path, where: str) -> Image:
+    """An image file as uint8 (H, W, 3) RGB.
+
+    Args:
+        where: row that names the file.
+
+    Raises:
+        DataError: it is missing or cannot be read.
+    """
+    from PIL import Image as PillowImage
+
+    try:
+        with PillowImage.open(file) as image:
+            return np.asarray(image.convert("RGB"), np.uint8)
+    except (OSError, ValueError, SyntaxError) as error:  # Pillow says SyntaxError for a broken PNG
+        raise DataError(f"{where}: image {file} cannot be read ({' '.join(str(error).split())})") from None
+
+
+def file_digest(file: Path) -> str:
+    """SHA-256 of a file."""
+    with file.open("rb") as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -1,0 +1,1 @@
+"""What can be learned from logged outcomes alone: replay, oracles, gaps, a verdict, off-policy estimates."""

@@ -1,0 +1,166 @@
+"""Replays of selectors over streams of a log, in processes; the result does not depend on how many."""
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.errors import OselError
+from osel_sim.formats.replay_result import Choices
+from osel_sim.offline.log import LoggedOutcomes
+from osel_sim.offline.streams import Streams, draw_streams
+from osel_sim.selection.reward import RewardWeights
+
+SLOW_FIRST = ("ppo", "auto", "neural_linear", "ppo_tuned", "vw_regcb", "vw_squarecb")
+"""Selectors whose replays take longest are begun first, so that no worker is left with a long one at the end."""
+
+
+@dataclass(frozen=True)
+class _Material:
+    """What a worker needs: contexts float32 (N, D), rewards (N, P, R), the streams, the seeds, policies, and each selector's settings."""
+
+    contexts: NDArray[np.float32]
+    rewards: NDArray[np.float64]
+    streams: Streams
+    seeds: tuple[int, ...]
+    policies: tuple[str, ...]
+    settings: dict[str, dict[str, Any]]
+
+
+def replay(
+    log: LoggedOutcomes,
+    weights: RewardWeights,
+    selectors: Sequence[str],
+    seeds: Sequence[int],
+    decisions: int | None = None,
+    workers: int = 1,
+    settings: dict[str, dict[str, Any]] | None = None,
+    progress: Callable[[int], Any] | None = None,
+) -> Choices:
+    """Show the streams of all seeds to every selector.
+
+    Args:
+        log: complete instances only (`osel_sim.offline.streams.complete_instances`).
+        selectors: names, as `osel_sim.selection.registry.make_selector` takes them.
+        seeds: of the streams, and of the selectors.
+        decisions: length of a stream; None: all instances.
+        workers: processes; with 1 it happens in this one.
+        settings: selector -> keyword arguments, where they are not to be the defaults.
+        progress: called with a number of decisions made.
+    """
+    table = log.rewards(weights)
+    streams = draw_streams(table, seeds, decisions)
+    material = _Material(log.contexts, table, streams, tuple(seeds), log.policies, settings or {})
+    jobs = [(name, number) for name in sorted(selectors, key=_slowness) for number in range(len(seeds))]
+    chosen = {name: np.zeros(streams.order.shape, np.int8) for name in selectors}
+    for name, number, columns in _run(material, jobs, workers):
+        chosen[name][number] = columns
+        if progress is not None:
+            progress(len(columns))
+    return Choices(log.keys, log.policies, streams.order, streams.repeats, chosen)
+
+
+def replay_one(
+    name: str, contexts: NDArray[np.float32], rewards: NDArray[np.float64], policies: Sequence[str], seed: int, **settings: Any
+) -> NDArray[np.int8]:
+    """Show one stream to one selector, which sees the reward of its choices only.
+
+    Args:
+        contexts: (T, D). rewards: (T, P).
+        settings: of the selector.
+
+    Returns:
+        columns chosen, (T,).
+    """
+    from osel_sim.offline.fast_ppo import FastPPO, supports
+    from osel_sim.selection.ppo import PPOSelector
+    from osel_sim.selection.registry import make_selector
+
+    selector = make_selector(name, policies, contexts.shape[1], seed, **settings)
+    if isinstance(selector, PPOSelector) and supports(selector):
+        return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
+    column = {policy: index for index, policy in enumerate(policies)}
+    chosen = np.zeros(len(contexts), np.int8)
+    for decision, context in enumerate(contexts):
+        choice = selector.select(context)
+        chosen[decision] = column[choice.policy]
+        selector.update(context, choice, float(rewards[decision, chosen[decision]]))
+    return chosen
+
+
+def _slowness(name: str) -> int:
+    return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
+
+
+def _run(material: _Material, jobs: Sequence[tuple[str, int]], workers: int) -> Iterator[tuple[str, int, NDArray[np.int8]]]:
+    if workers == 1:
+        with _one_thread():
+            for job in jobs:
+                yield _job(material, *job)
+        return
+    context = multiprocessing.get_context("spawn")  # a forked torch or numba is a hang waiting to happen
+    with ProcessPoolExecutor(workers, context, _prepare, (material,)) as pool:
+        try:
+            for future in as_completed([pool.submit(_in_worker, *job) for job in jobs]):
+                yield future.result()
+        except BrokenProcessPool:
+            raise OselError("a worker process of the replay died (out of memory?); try --workers 1") from None
+        except BaseException:
+            # Otherwise leaving the pool waits for the replays that are running.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+_material: _Material | None = None
+
+
+def _prepare(material: _Material) -> None:
+    """Make a worker ready."""
+    global _material
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C: end without a word, the parent says what there is to say
+    _limit_threads()
+    _material = material
+
+
+def _in_worker(name: str, number: int) -> tuple[str, int, NDArray[np.int8]]:
+    if _material is None:
+        raise OselError("a worker process of the replay was not prepared")
+    return _job(_material, name, number)
+
+
+def _job(material: _Material, name: str, number: int) -> tuple[str, int, NDArray[np.int8]]:
+    streams = material.streams
+    rewards = streams.rewards(material.rewards, number)
+    contexts = material.contexts[streams.order[number]]
+    contexts.flags.writeable = False
+    return name, number, replay_one(name, contexts, rewards, material.policies, material.seeds[number], **material.settings.get(name, {}))
+
+
+def _limit_threads() -> Any:
+    """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    torch.set_num_threads(1)
+    return threadpool_limits(1)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    import torch
+
+    threads = torch.get_num_threads()
+    try:
+        with _limit_threads():
+            yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,48 @@
+"""A number with its 95% interval, and how to get one."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from osel_sim.statistics import bootstrap_mean_interval, wilson_interval
+
+if TYPE_CHECKING:
+    from osel_sim.offline.log import Array
+
+RESAMPLES = 2_000
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its 95% interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def mean_of(values: ArrayLike) -> Estimate | None:
+    """Mean of what is not NaN with its bootstrap interval; None of nothing."""
+    sample = np.asarray(values, np.float64).ravel()
+    sample = sample[np.isfinite(sample)]
+    if not sample.size:
+        return None
+    return Estimate(float(sample.mean()), *bootstrap_mean_interval(sample, resamples=RESAMPLES))
+
+
+def rate_of(outcomes: "Array") -> Estimate | None:
+    """Share of successes among the outcomes (N, R) that are not NaN; None of nothing.
+
+    Wilson's interval where each instance was tried once; with repeats, which are no independent trials, or with graded outcomes a bootstrap over
+    instances.
+    """
+    known = outcomes[np.isfinite(outcomes).any(axis=-1)]
+    if not known.size:
+        return None
+    per_instance = np.nanmean(known, axis=-1)
+    if np.isfinite(known).sum() == len(known) and np.isin(per_instance, (0.0, 1.0)).all():
+        return Estimate(float(per_instance.mean()), *wilson_interval(int(per_instance.sum()), len(per_instance)))
+    # The rate is that of the mean instance, so that one with more repeats does not weigh more.
+    return mean_of(per_instance)

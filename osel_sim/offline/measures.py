@@ -1,0 +1,153 @@
+"""What a replay's choices came to: rewards with intervals, share of the learnable gap, regret, differences."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from osel_sim.formats.replay_result import Choices
+from osel_sim.offline.log import Array, LoggedOutcomes
+from osel_sim.offline.oracles import Oracles
+from osel_sim.selection.reward import RewardWeights
+from osel_sim.statistics import Interval, bootstrap_mean_interval
+
+RESAMPLES = 10_000
+LATE = 0.25
+"""The share of a stream's decisions that counts as late."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What was received and what could have been, in every decision of every seed, (S, T).
+
+    Attributes:
+        selectors: name -> reward.
+        oracles: hindsight, expected (where there are repeats), predictable, per_task, best_single -> reward.
+        learnable: which oracle bounds what can be learned.
+        late: first decision of the late part.
+    """
+
+    selectors: dict[str, Array]
+    oracles: dict[str, Array]
+    learnable: str
+    late: int
+
+
+def curves(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: Oracles) -> Curves:
+    """Rewards decision by decision.
+
+    Args:
+        log: the instances of `choices`, in its order.
+        best: of the same log and weights.
+    """
+    table = log.rewards(weights)
+    outcomes = choices.outcomes(table)
+    tasks = best.per_task[choices.order][:, :, None]
+    found = {
+        "hindsight": outcomes.max(axis=2),
+        **({} if best.expected is None else {"expected": best.expected[choices.order]}),
+        "predictable": best.predictable[choices.order],
+        "per_task": np.take_along_axis(outcomes, tasks, axis=2)[:, :, 0],
+        "best_single": outcomes[:, :, best.best_single],
+    }
+    decisions = choices.order.shape[1]
+    received = {name: choices.received(name, table) for name in choices.chosen}
+    return Curves(received, found, best.learnable, decisions - max(1, int(decisions * LATE)))
+
+
+def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -> dict[str, Any]:
+    """One selector: what `replay.json` says about it under `selectors`."""
+    received = rewards.selectors[name]
+    of_each = {"success": log.success, "subgoals": log.subgoals, "steps": log.steps, "seconds": log.seconds, "price": log.price}
+    got = {what: _mean(choices.received(name, values)) for what, values in of_each.items()}
+    chosen = choices.chosen[name]
+    late = slice(rewards.late, None)
+    successes = choices.received(name, log.success)
+    return {
+        "mean_reward": float(received.mean()),
+        "ci95": list(bootstrap_mean_interval(received.mean(axis=1))),
+        "mean_reward_late": float(received[:, late].mean()),
+        "success_rate": got["success"],
+        "success_ci95": list(bootstrap_mean_interval(successes.mean(axis=1))) if got["success"] is not None else None,
+        "mean_subgoals": got["subgoals"],
+        "mean_steps": got["steps"],
+        "mean_seconds": got["seconds"],
+        "mean_price": got["price"],
+        "shares": {policy: float((chosen == column).mean()) for column, policy in enumerate(choices.policies)},
+        "shares_late": {policy: float((chosen[:, late] == column).mean()) for column, policy in enumerate(choices.policies)},
+        **_gap_entries("learnable_gap_closed", gap_closed(received, rewards, 0)),
+        **_gap_entries("learnable_gap_closed_late", gap_closed(received, rewards, rewards.late)),
+        "regret": {oracle: float((values - received).mean()) for oracle, values in rewards.oracles.items()},
+        "regret_ci95": {oracle: list(bootstrap_mean_interval((values - received).mean(axis=1))) for oracle, values in rewards.oracles.items()},
+        "decisions_until_ahead": until_ahead(received - rewards.oracles["best_single"]),
+        "decisions_until_better": until_better(received - rewards.oracles["best_single"]),
+    }
+
+
+def gap_closed(received: Array, rewards: Curves, first: int) -> tuple[float, Interval] | None:
+    """Share of the learnable gap closed from decision `first` on, with its 95 % bootstrap interval over seeds.
+
+    (selector - best single) / (learnable oracle - best single), all averaged over seeds and decisions. None where the learnable oracle is not better
+    than the best single policy, so that there is no gap to close.
+    """
+    base = rewards.oracles["best_single"][:, first:].mean(axis=1)
+    gains = received[:, first:].mean(axis=1) - base
+    gaps = rewards.oracles[rewards.learnable][:, first:].mean(axis=1) - base
+    if gaps.mean() <= 0.0:
+        return None
+    generator = np.random.default_rng(0)
+    rows = generator.integers(len(gains), size=(RESAMPLES, len(gains)))
+    below = gaps[rows].mean(axis=1)
+    shares = np.where(below > 0.0, gains[rows].mean(axis=1) / np.where(below > 0.0, below, 1.0), np.nan)
+    if not np.isfinite(shares).all():
+        return None
+    low, high = np.quantile(shares, [0.025, 0.975])
+    return float(gains.mean() / gaps.mean()), (float(low), float(high))
+
+
+def until_ahead(differences: Array) -> int | None:
+    """After how many decisions the sum of the differences (S, T), averaged over seeds, is positive and stays so; None: not at the end."""
+    total = differences.mean(axis=0).cumsum()
+    behind = np.flatnonzero(total <= 0.0)
+    if not len(behind):
+        return 1
+    return None if behind[-1] == len(total) - 1 else int(behind[-1]) + 2
+
+
+def until_better(differences: Array) -> int | None:
+    """After how many decisions the sum of the differences (S, T), averaged over seeds, is lowest: later ones win more than they lose."""
+    # At the end it has not begun to win yet.
+    total = np.concatenate([[0.0], differences.mean(axis=0).cumsum()])
+    lowest = int(total.argmin())
+    return None if lowest == len(total) - 1 else lowest
+
+
+def paired(rewards: Curves, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Mean differences in reward between any two selectors on the same streams, with bootstrap intervals over seeds."""
+    result = []
+    for index, one in enumerate(names):
+        for other in names[index + 1 :]:
+            difference = (rewards.selectors[one] - rewards.selectors[other]).mean(axis=1)
+            late = (rewards.selectors[one] - rewards.selectors[other])[:, rewards.late :].mean(axis=1)
+            result.append(
+                {
+                    "a": one,
+                    "b": other,
+                    "difference": float(difference.mean()),
+                    "ci95": list(bootstrap_mean_interval(difference)),
+                    "difference_late": float(late.mean()),
+                    "ci95_late": list(bootstrap_mean_interval(late)),
+                }
+            )
+    return result
+
+
+def _gap_entries(name: str, found: tuple[float, Interval] | None) -> dict[str, Any]:
+    return {name: None if found is None else found[0], f"{name}_ci95": None if found is None else list(found[1])}
+
+
+def _mean(values: Array) -> float | None:
+    """Mean of what is known; None where nothing is."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else None

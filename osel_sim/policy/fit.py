@@ -1,0 +1,142 @@
+"""Whether a LeRobot checkpoint and a policy file fit together, said before anything runs."""
+
+import difflib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+
+from osel_sim.errors import CheckpointError
+from osel_sim.formats.mapping import ENVIRONMENT_STATES, STATE_PARTS, Mapping
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.policy.base import ACTION_DIM
+
+PREPROCESSOR = "policy_preprocessor.json"
+
+
+def check_fit(spec: PolicySpec, config: PreTrainedConfig, fills_environment_state: bool = False) -> None:
+    """Whether the policy file gives what a checkpoint wants.
+
+    Args:
+        fills_environment_state: the checkpoint's own preprocessor makes `observation.environment_state`.
+
+    Raises:
+        CheckpointError: saying what the checkpoint wants, what the policy file gives, and what to write instead.
+    """
+    problems = [*_images(spec, config), *_state(spec, config), *_action(spec, config), *_others(spec, config, fills_environment_state)]
+    if problems:
+        raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} does not fit: {'; '.join(problems)}")
+
+
+def check_normalisation(spec: PolicySpec, config: PreTrainedConfig, before: Any, after: Any) -> None:
+    """Whether the processors know the statistics by which the checkpoint's inputs and actions were normalised.
+
+    LeRobot passes a feature without statistics as it is: the policy would be shown metres where it learnt standard deviations.
+
+    Raises:
+        CheckpointError: naming the features without statistics.
+    """
+    if not spec.mapping.normalised:
+        return
+    modes = {FeatureType(kind) if not isinstance(kind, FeatureType) else kind: mode for kind, mode in (config.normalization_mapping or {}).items()}
+    sides = ((before, NormalizerProcessorStep, config.input_features or {}), (after, UnnormalizerProcessorStep, config.output_features or {}))
+    lacking: list[str] = []
+    for pipeline, kind, features in sides:
+        known = {name.rpartition(".")[0] for step in pipeline.steps if isinstance(step, kind) for name in step.state_dict()}
+        normalised = [key for key, feature in features.items() if modes.get(feature.type, NormalizationMode.IDENTITY) != NormalizationMode.IDENTITY]
+        lacking += [key for key in normalised if key not in known]
+    if lacking:
+        raise CheckpointError(
+            f"{spec.file}: checkpoint {spec.checkpoint!r} was trained with normalised {', '.join(lacking)}, but its processors hold no statistics "
+            "for that: save the processors with the dataset's statistics beside the weights, or say normalised = false in [mapping] if that is meant"
+        )
+
+
+def check_processors(spec: PolicySpec, checkpoint: str) -> None:
+    """Whether a local checkpoint has processors at all; those saved before LeRobot 0.4 kept their statistics among the weights.
+
+    Raises:
+        CheckpointError: it has none.
+    """
+    folder = Path(checkpoint)
+    if folder.is_dir() and not (folder / PREPROCESSOR).is_file():
+        raise CheckpointError(
+            f"{spec.file}: checkpoint {spec.checkpoint!r} has no {PREPROCESSOR}: it was saved without its processors, or before LeRobot 0.4; "
+            f"python -m lerobot.processor.migrate_policy_normalization --pretrained-path {checkpoint} makes them"
+        )
+
+
+def fills_environment_state(checkpoint: str) -> bool:
+    """Whether a local checkpoint's preprocessor has a step of ours that makes `observation.environment_state`."""
+    from osel_sim.policy.processing import TEXT_EMBEDDING
+
+    try:
+        steps = json.loads((Path(checkpoint) / PREPROCESSOR).read_bytes())["steps"]
+        return any(step.get("registry_name") == TEXT_EMBEDDING for step in steps)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+
+
+def camera_keys(mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, str]:
+    """Checkpoint's image key -> camera here."""
+    return {mapping.key(camera): camera for camera in cameras}
+
+
+def _images(spec: PolicySpec, config: PreTrainedConfig) -> Iterator[str]:
+    given = camera_keys(spec.mapping, spec.cameras)
+    wanted = list(config.image_features)
+    for key in sorted(set(wanted) - set(given) - set(spec.mapping.blank)):
+        free = [name for name in given if name not in wanted]
+        near = next(iter(difflib.get_close_matches(key, free, n=1, cutoff=0.0)), None)
+        advice = "name a camera for it in [observation] cameras" if near is None else f'perhaps [mapping.images] {given[near]} = "{key}"'
+        yield f'it wants {key}, the policy file gives {", ".join(sorted(given))} ({advice}; or leave it black: [mapping] blank = ["{key}"])'
+    for key in sorted((set(given) | set(spec.mapping.blank)) - set(wanted)):
+        if key in spec.mapping.images.values() or key in spec.mapping.blank:
+            near = difflib.get_close_matches(key, wanted, n=1, cutoff=0.0)
+            yield f"[mapping] gives it {key}, which it does not know" + (f": did you mean {near[0]!r}?" if near else "")
+
+
+def _state(spec: PolicySpec, config: PreTrainedConfig) -> Iterator[str]:
+    wanted, mapping = config.robot_state_feature, spec.mapping
+    if wanted is None or tuple(wanted.shape) == (mapping.state_size,):
+        return
+    parts = " + ".join(f"{part} {STATE_PARTS[part]}" for part in mapping.state_parts)
+    sizes = ", ".join(f"{part} {size}" for part, size in STATE_PARTS.items())
+    yield (
+        f"it wants {OBS_STATE} of shape {tuple(wanted.shape)}, the simulation gives ({mapping.state_size},): {parts} "
+        f"([mapping] state_parts can be put together from {sizes})"
+    )
+
+
+def _action(spec: PolicySpec, config: PreTrainedConfig) -> Iterator[str]:
+    action, columns = config.action_feature, spec.mapping.columns
+    if action is None or len(action.shape) != 1:
+        yield f"it gives {ACTION} of shape {tuple(action.shape) if action else 'none'}, the robot takes (7,)"
+        return
+    size = action.shape[0]
+    if not columns and size != ACTION_DIM:
+        yield f"it gives {ACTION} of shape ({size},), the robot takes ({ACTION_DIM},): six motions and the gripper; say in [mapping] columns which"
+    elif columns and max(columns) >= size:
+        yield f"[mapping] columns names number {max(columns)} of an action, it gives {ACTION} of shape ({size},)"
+
+
+def _others(spec: PolicySpec, config: PreTrainedConfig, fills: bool) -> Iterator[str]:
+    features = config.input_features or {}
+    if config.env_state_feature is not None and not fills and not spec.mapping.environment_state:
+        known = ", ".join(f'"{name}"' for name in ENVIRONMENT_STATES)
+        yield f"it wants {OBS_ENV_STATE}, which nothing here gives unless [mapping] environment_state says what it is (known: {known})"
+    for key in sorted(set(features) - {*config.image_features, OBS_STATE, OBS_ENV_STATE}):
+        hint = f"; is it an image? then it must be called {OBS_IMAGES}.NAME" if "image" in key else ""
+        yield f"it wants {key}, which nothing here gives{hint}"
+    chunk = getattr(config, "chunk_size", None) or (getattr(config, "n_action_steps", None) if config.type == "diffusion" else None)
+    if chunk is not None and chunk < spec.execute:
+        yield f"its chunks hold {chunk} actions, execute = {spec.execute}"
+    if (config.n_obs_steps or 1) > 1 and spec.execute != 1:
+        yield (
+            f"it looks at the last {config.n_obs_steps} observations, which must be one step apart: set execute = 1 "
+            f"(it is asked every step then, and plans anew when its own chunk is used up)"
+        )

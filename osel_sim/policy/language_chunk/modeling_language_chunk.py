@@ -1,0 +1,81 @@
+"""The language-conditioned chunk policy: finds the object and the container named by the instruction, then moves.
+
+Words become queries; each is compared with every place of every camera's feature map, and the place it matches, with an estimate
+of its position in the world, goes into the action head together with keypoints, proprioception and the sentence. The map that queries
+are compared with is computed without any text, so in training each image also serves instructions about the other things in the scene.
+"""
+
+from typing import Any
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import ACTION
+from torch import Tensor, nn
+
+from osel_sim.policy.grounding import PLACE_FEATURES, STATE_FEATURES, Grounding, TextEncoder, View
+from osel_sim.policy.language_chunk.configuration_language_chunk import LanguageChunkConfig
+from osel_sim.policy.language_chunk.network import ActionHead, Camera
+from osel_sim.policy.scene import ChunkQueue, action_weight, grounding_losses, look
+
+
+class LanguageChunkPolicy(ChunkQueue, PreTrainedPolicy):  # type: ignore[misc]
+    """See the module. Batches come from `make_language_chunk_pre_post_processors`."""
+
+    config_class = LanguageChunkConfig
+    name = "language_chunk"
+
+    def __init__(self, config: LanguageChunkConfig, **_: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        self.config: LanguageChunkConfig = config
+        action = config.action_feature
+        if action is None:  # validate_features has said so already; this is for the type checker
+            raise ValueError("language_chunk needs an action feature")
+        self.image_keys = list(config.image_features)
+        self.text = TextEncoder(config)
+        self.cameras = nn.ModuleList(Camera(config, key.split(".")[-1] in config.mounted_cameras) for key in self.image_keys)
+        per_camera = config.queries * (PLACE_FEATURES + config.channels + 4) + 2 * config.keypoints + config.channels
+        inputs = len(self.image_keys) * per_camera + STATE_FEATURES + config.text_dim + config.queries * 7
+        self.head = ActionHead(inputs, config.hidden, config.hidden_layers, config.chunk_size, action.shape[0])
+        self.reset()
+
+    def compute(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, list[tuple[View, Grounding]]]:
+        """The network.
+
+        Returns:
+            actions (batch, chunk, action_dim); fused position estimates (batch, 1 + pairs, queries, 4), the last of the four being the
+            logarithm of the expected error; and what each camera saw and found.
+        """
+        scene = look(self.text, self.cameras, self.image_keys, batch)
+        cameras = [camera for camera in self.cameras if isinstance(camera, Camera)]
+        pairs = zip(cameras, scene.raw, scene.views, strict=True)
+        points = [camera.keypoints(raw, view.places, scene.sentence) for camera, raw, view in pairs]
+        state, fused = scene.state, scene.fused
+        with torch.autocast(state.device.type, enabled=False):
+            own = fused[:, 0]
+            parts = [state, scene.sentence, own.flatten(1), (own[..., :3] - state[:, None, :3]).flatten(1)]
+            for grounding in scene.grounded:
+                parts += [part[:, 0].flatten(1) for part in (grounding.found, grounding.attended, grounding.estimate)]
+            for keypoints, mean in points:
+                parts += [keypoints, mean]
+            actions = self.head(torch.cat(parts, dim=-1))
+        return actions, fused, list(zip(scene.views, scene.grounded, strict=True))
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float] | None]:
+        """Loss: L1 of the actions not beyond the episode's end, plus those of the labelled positions and places, if there are any."""
+        actions, fused, cameras = self.compute(batch)
+        action_loss = ((actions - batch[ACTION]).abs() * action_weight(batch, actions, self.config.gripper_weight)).sum()
+        views, grounded = [view for view, _ in cameras], [grounding for _, grounding in cameras]
+        labelled, report = grounding_losses(views, grounded, fused, batch, self.config)
+        return action_loss + labelled, {"action_loss": action_loss.item(), **report}
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **_: Any) -> Tensor:
+        """Chunk of actions (batch, chunk_size, action_dim), not yet postprocessed."""
+        self.eval()
+        return self.compute(batch)[0]
+
+    @torch.no_grad()
+    def locate(self, batch: dict[str, Tensor]) -> Tensor:
+        """Where the things that the instruction names are thought to be: (batch, queries, 3), in the state's normalised coordinates."""
+        return look(self.text, self.cameras, self.image_keys, batch).fused[:, 0, :, :3]

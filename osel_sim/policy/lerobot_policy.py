@@ -1,0 +1,173 @@
+"""Drives the robot with any LeRobot checkpoint: a folder or a hub name, LeRobot's own types or a plugin's."""
+
+import contextlib
+import copy
+import io
+import logging
+import zlib
+from collections.abc import Callable, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class, make_pre_post_processors
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.import_utils import register_third_party_plugins
+from torch import Tensor
+
+from osel_sim import content
+from osel_sim.errors import CheckpointError
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.hub import offline_if_unreachable
+from osel_sim.policy import register
+from osel_sim.policy.base import Actions, Observation, Policy
+from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors, fills_environment_state
+from osel_sim.policy.mapping import actions_of, state_of
+from osel_sim.policy.text import embed
+
+THREADS = 1
+"""Threads of one inference. Sums are split differently among another number of threads, so their last bits would depend on the machine."""
+
+
+def load(spec: PolicySpec) -> Callable[[], Policy]:
+    """Load the weights once; the result makes sessions that share them, each with its own state.
+
+    Raises:
+        CheckpointError: missing, unreadable, without access to the hub, or not fitting the policy file.
+    """
+    checkpoint = str(content.resolve_checkpoint(spec.checkpoint))
+    if not spec.checkpoint:
+        raise CheckpointError(f"{spec.file}: checkpoint: is missing, a policy of kind 'lerobot' needs a folder or a hub name")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    with quiet(), contextlib.nullcontext() if Path(checkpoint).is_dir() else offline_if_unreachable():
+        register()
+        register_third_party_plugins()
+        config = _config(spec, checkpoint)
+        config.device = device
+        check_fit(spec, config, fills_environment_state(checkpoint))
+        check_processors(spec, checkpoint)
+        policy, processors = _weights(spec, checkpoint, config, device)
+        check_normalisation(spec, config, *processors)
+    return lambda: LeRobotPolicy(spec, policy, processors)
+
+
+class LeRobotPolicy:
+    """One session of a LeRobot policy; made by `load`."""
+
+    def __init__(self, spec: PolicySpec, policy: PreTrainedPolicy, processors: tuple[Any, Any]) -> None:
+        shared = {id(tensor): tensor for tensor in chain(policy.parameters(), policy.buffers())}
+        self._policy = copy.deepcopy(policy, shared)  # own queues and caches, shared weights
+        self._before, self._after = copy.deepcopy(processors)
+        self._mapping, self._cameras = spec.mapping, camera_keys(spec.mapping, spec.cameras)
+        self._instruction, self._calls = "", 0
+        self._context: Tensor | None = None
+
+    def reset(self, instruction: str) -> None:
+        """Start a new episode."""
+        self._instruction, self._calls = instruction, 0
+        feature = self._policy.config.env_state_feature
+        if feature is not None and self._mapping.environment_state:
+            self._context = torch.from_numpy(embed(instruction, feature.shape[0]))
+        self._policy.reset()
+        self._before.reset()
+        self._after.reset()
+
+    def act(self, observation: Observation) -> Actions:
+        """The next chunk of actions, (T, 7) float32 in [-1, 1]; the same bits for the same observations since the last reset.
+
+        A policy that looks at several observations is asked for one action at a time, as its own memory of them wants it.
+        """
+        config = self._policy.config
+        batch: dict[str, Any] = {"task": self._instruction}
+        for key, feature in config.image_features.items():
+            size = feature.shape[-2:]
+            batch[key] = _image(observation[f"{OBS_IMAGES}.{self._cameras[key]}"], size) if key in self._cameras else torch.zeros(3, *size)
+        if config.robot_state_feature is not None:
+            batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping))
+        if self._context is not None:
+            batch[OBS_ENV_STATE] = self._context
+        with torch.inference_mode(), threads(THREADS), drawing(self._instruction, self._calls):
+            prepared = {key: value for key, value in self._before(batch).items() if isinstance(value, Tensor)}
+            # the postprocessor knows single actions (batch, 7): a chunk's steps take the batch's place
+            stepwise = (config.n_obs_steps or 1) > 1
+            chunk = self._policy.select_action(prepared) if stepwise else self._policy.predict_action_chunk(prepared)[0]
+            actions = self._after(chunk)
+        self._calls += 1
+        return actions_of(actions.float().cpu().numpy(), self._mapping).clip(-1.0, 1.0).astype(np.float32)
+
+
+def _config(spec: PolicySpec, checkpoint: str) -> PreTrainedConfig:
+    a_path = checkpoint.startswith(("/", ".")) or checkpoint.count("/") != 1  # hub names are owner/name
+    if a_path and not Path(checkpoint).is_dir():
+        raise CheckpointError(
+            f"{spec.file}: checkpoint {spec.checkpoint!r} is no folder; train one with python -m osel_sim.train --policy {spec.name}"
+        )
+    try:
+        return PreTrainedConfig.from_pretrained(checkpoint)
+    except Exception as error:  # the hub client, JSON and draccus all have their own
+        raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} cannot be read: {_line(error)}") from error
+
+
+def _weights(spec: PolicySpec, checkpoint: str, config: PreTrainedConfig, device: str) -> tuple[PreTrainedPolicy, tuple[Any, Any]]:
+    try:
+        policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config, strict=True)
+        overrides = {"device_processor": {"device": device}}
+        processors = make_pre_post_processors(config, checkpoint, preprocessor_overrides=overrides, postprocessor_overrides={})
+    except Exception as error:
+        raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} of type {config.type!r} cannot be loaded: {_line(error)}") from error
+    policy.eval()
+    for parameter in policy.parameters():
+        parameter.requires_grad_(False)
+    return policy, processors
+
+
+def _line(error: Exception) -> str:
+    """The first line of an error, which is what fits into one."""
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0] if lines else ''}"
+
+
+def _image(image: np.ndarray[Any, Any], size: tuple[int, ...]) -> Tensor:
+    """uint8 (H, W, 3) -> float (3, h, w) in [0, 1] as LeRobot's datasets give it, brought to the size the checkpoint was trained with."""
+    pixels = torch.from_numpy(np.array(image)).permute(2, 0, 1).float() / 255
+    if pixels.shape[-2:] != tuple(size):
+        pixels = torch.nn.functional.interpolate(pixels[None], size=tuple(size), mode="bilinear", antialias=True)[0].clamp(0, 1)
+    return pixels
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without what LeRobot prints while it loads and what the hub's client logs about each of its retries: the error says it once."""
+    logger = logging.getLogger("huggingface_hub")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def drawing(instruction: str, call: int) -> Iterator[None]:
+    """With torch's random numbers those of an instruction and call, for policies that start from noise; put back afterwards."""
+    with torch.random.fork_rng(devices=[torch.cuda.current_device()] if torch.cuda.is_available() else []):
+        torch.manual_seed(zlib.crc32(instruction.encode()) + call)
+        yield
+
+
+@contextlib.contextmanager
+def threads(count: int) -> Iterator[None]:
+    """Compute with so many threads for a while."""
+    before = torch.get_num_threads()
+    if before != count:
+        torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        if before != count:
+            torch.set_num_threads(before)

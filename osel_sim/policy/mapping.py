@@ -1,0 +1,85 @@
+"""Applies a policy file's `[mapping]`: our observations in a policy's words, its actions in ours."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.errors import PolicyError
+from osel_sim.formats.mapping import Mapping
+from osel_sim.policy.base import ACTION_DIM, Observation
+
+STATE = "observation.state"
+OPEN_FINGER = 0.04
+"""Where a finger of the fully open gripper is, metres."""
+
+
+def state_of(observation: Observation, mapping: Mapping) -> NDArray[np.float32]:
+    """The state as the policy wants it, (state_size,)."""
+    state = np.asarray(observation[STATE], np.float64)
+    return np.concatenate([_part(state, part) for part in mapping.state_parts]).astype(np.float32)
+
+
+def _part(state: NDArray[np.float64], part: str) -> NDArray[np.float64]:
+    """One of `STATE_PARTS` of our state (8,)."""
+    if part == "gripper":
+        return np.clip((state[6:7] - state[7:8]) / (2 * OPEN_FINGER), 0.0, 1.0)
+    if part in ("quaternion", "euler"):
+        return quaternion(state[3:6]) if part == "quaternion" else euler(state[3:6])
+    return {"position": state[:3], "axis_angle": state[3:6], "fingers": state[6:8]}[part]
+
+
+def message_of(observation: Observation, mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, Any]:
+    """An observation under the policy's own names."""
+    message: dict[str, Any] = {mapping.key(camera): observation[f"observation.images.{camera}"] for camera in cameras}
+    if cameras:
+        shape = observation[f"observation.images.{cameras[0]}"].shape
+        message |= {key: np.zeros(shape, np.uint8) for key in mapping.blank}
+    if mapping.state:
+        message[mapping.state] = state_of(observation, mapping)
+    message[mapping.prompt] = observation["task"]
+    return message
+
+
+def actions_of(value: Any, mapping: Mapping) -> NDArray[Any]:
+    """A policy's chunk (T, N), or single action (N,), as OSC_POSE actions (T, 7).
+
+    Raises:
+        PolicyError: it is no such array.
+    """
+    try:
+        actions = np.asarray(value)
+    except ValueError as error:  # ragged lists
+        raise PolicyError(f"actions are not an array ({error})") from None
+    if actions.dtype.kind not in "fiu":
+        raise PolicyError(f"actions must be real numbers, got dtype {actions.dtype}")
+    actions = np.atleast_2d(actions)
+    if actions.ndim != 2 or (not mapping.columns and actions.shape[1] != ACTION_DIM):
+        raise PolicyError(f"actions have the shape {actions.shape}, the robot takes (T, {ACTION_DIM}); say in [mapping] columns which those are")
+    columns = list(mapping.columns or range(ACTION_DIM))
+    if actions.shape[1] <= max(columns):
+        raise PolicyError(f"actions have the shape {actions.shape}, [mapping] columns = {columns} needs more numbers in each")
+    result = actions[:, columns].astype(np.float64)
+    result[:, :6] *= mapping.scale
+    gripper = result[:, 6]
+    if mapping.gripper.endswith("_one"):
+        gripper = 2 * gripper - 1
+    result[:, 6] = -gripper if mapping.gripper.startswith("open") else gripper
+    return result
+
+
+def quaternion(axis_angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axis-angle (3,) -> quaternion (x, y, z, w) with w >= 0."""
+    angle = float(np.linalg.norm(axis_angle))
+    axis = axis_angle / angle if angle > 0 else np.zeros(3)
+    result = np.concatenate([axis * np.sin(angle / 2), [np.cos(angle / 2)]])
+    return -result if result[3] < 0 else result
+
+
+def euler(axis_angle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axis-angle (3,) -> roll, pitch and yaw (3,) in radians, turned about the fixed x, then y, then z axis."""
+    x, y, z, w = quaternion(axis_angle)
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.array([roll, pitch, yaw])

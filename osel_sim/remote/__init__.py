@@ -1,0 +1,1 @@
+"""A policy behind a network: wire protocol, server, client, and a network simulated on a virtual clock."""

@@ -1,0 +1,216 @@
+"""The robot's end of the line: asks a policy server for actions, trusts nothing it says, and never waits for ever."""
+
+import contextlib
+import ipaddress
+import socket
+import struct
+import time
+from dataclasses import dataclass
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.sync.client import ClientConnection, connect
+
+from osel_sim.errors import PolicyError, RemoteError
+from osel_sim.formats.mapping import Mapping
+from osel_sim.policy.base import Actions, Observation
+from osel_sim.policy.call import check_actions
+from osel_sim.policy.mapping import actions_of, message_of
+from osel_sim.remote.codec import ProtocolError, pack, unpack
+from osel_sim.remote.protocol import IMAGES, RESET, Greeting
+
+MAX_ANSWER = 16 << 20  # bytes; a chunk of 1,000 actions has 56,000
+CLOSE_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came back for one observation.
+
+    Attributes:
+        actions: (T, 7) float32 in [-1, 1].
+        measured_seconds: from sending to having it, on this machine.
+        bytes_up, bytes_down: length of the two frames; the answer's without its timing entries, which would make a price depend on the machine.
+    """
+
+    actions: Actions
+    measured_seconds: float
+    bytes_up: int
+    bytes_down: int
+
+
+class RemoteClient:
+    """A connection to one policy server, ours or any that speaks openpi's protocol.
+
+    After an error the connection is closed, since what would come next on it is unknown; `reset` opens a new one.
+
+    Args:
+        url: `ws://host:port` or `wss://...`.
+        token: sent as `Authorization: Api-Key ...`; None sends none.
+        timeout: real seconds for one answer, and for connecting.
+        expect: what a server of ours must say it is; None takes any.
+        mapping: names and conventions of a server that is not ours.
+    """
+
+    def __init__(
+        self, url: str, token: str | None = None, timeout: float = 30.0, expect: Greeting | None = None, mapping: Mapping | None = None
+    ) -> None:
+        self.url, self._token, self._timeout, self._expect = url, token, timeout, expect
+        self._mapping = mapping or Mapping()
+        self._connection: ClientConnection | None = None
+        self._hang_up = contextlib.ExitStack()
+        self._greeting: Greeting | None = None
+
+    def __enter__(self) -> Self:
+        self.connect()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def connected(self) -> bool:
+        """Whether a call can be made without a `reset` first."""
+        return self._connection is not None
+
+    @property
+    def foreign(self) -> bool:
+        """Whether the server it is connected to is not ours: then the mapping counts, and it knows no reset."""
+        return self._connection is not None and self._greeting is None
+
+    def connect(self) -> None:
+        """Connect and read the greeting; nothing if connected already.
+
+        Raises:
+            RemoteError: nobody there, the token refused, or not a policy server we can work with.
+        """
+        if self._connection is not None:
+            return
+        end = time.monotonic() + self._timeout
+        self._connection = self._open()
+        metadata = self._decode(self._receive(end), "greeting")
+        try:
+            self._greeting = Greeting.parse(metadata)
+        except ProtocolError as error:
+            raise self._fail(str(error)) from None
+        if self._greeting is not None and self._expect is not None and self._greeting != self._expect:
+            raise self._fail(f"serves {self._greeting}, expected {self._expect}")
+
+    def reset(self, instruction: str) -> None:
+        """Start a new episode, on a new connection if there is none. A server that does not know the word is not bothered with it.
+
+        Raises:
+            RemoteError: as `connect`, or the server did not agree.
+        """
+        self.connect()
+        if self._greeting is None:
+            return
+        reply, _ = self._ask({RESET: instruction})
+        if reply != {RESET: instruction}:
+            raise self._fail("answered a reset with something else")
+
+    def act(self, observation: Observation) -> Answer:
+        """Actions for one observation.
+
+        Raises:
+            RemoteError: timeout, closed, an error message, or an answer without proper actions.
+        """
+        start = time.perf_counter()
+        if self._connection is None:
+            raise RemoteError(f"{self.url}: not connected")
+        reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation)) if self.foreign else observation)
+        measured = time.perf_counter() - start
+        key = self._mapping.actions if self.foreign else "actions"
+        if not isinstance(reply, dict) or key not in reply:
+            got = ", ".join(sorted(str(name)[:40] for name in list(reply)[:10])) if isinstance(reply, dict) else type(reply).__name__
+            raise self._fail(f"answered without {key} (it has: {got or 'nothing'})")
+        try:
+            actions = check_actions(actions_of(reply[key], self._mapping) if self.foreign else reply[key])
+        except PolicyError as error:
+            raise self._fail(str(error)) from None
+        payload = {key: value for key, value in reply.items() if not (isinstance(key, str) and key.endswith("timing"))}
+        return Answer(actions, measured, bytes_up, len(pack(payload)))
+
+    def close(self) -> None:
+        """Hang up. May be called twice; takes at most a second or so."""
+        self._connection = None
+        with contextlib.suppress(OSError, WebSocketException):
+            self._hang_up.close()
+
+    def _open(self) -> ClientConnection:
+        headers = {"Authorization": f"Api-Key {self._token}"} if self._token else None
+        try:
+            opening = connect(
+                self.url,
+                additional_headers=headers,
+                compression=None,
+                max_size=MAX_ANSWER,
+                open_timeout=self._timeout,
+                close_timeout=CLOSE_SECONDS,
+                ping_interval=None,  # a server that computes in its event loop (openpi's) answers no pings meanwhile
+                proxy=None if _is_loopback(self.url) else True,
+            )
+            connection = self._hang_up.enter_context(opening)
+        except InvalidStatus as error:
+            status = error.response.status_code
+            raise RemoteError(f"{self.url}: " + ("refused the token" if status in (401, 403) else f"answered HTTP {status}")) from None
+        except TimeoutError:
+            raise RemoteError(f"{self.url}: no connection within {self._timeout:g} s") from None
+        except OSError as error:
+            raise RemoteError(f"{self.url}: cannot connect ({error.strerror or error})") from None
+        except (WebSocketException, ValueError, AssertionError) as error:
+            # AssertionError: websockets trips over its own close_deadline when the other side talks nonsense before the handshake is sent.
+            raise RemoteError(f"{self.url}: is no WebSocket server ({str(error) or type(error).__name__})") from None
+        # Sending blocks for ever when the server stops reading and the buffers are full, unless the socket itself has a limit.
+        seconds, fraction = divmod(self._timeout, 1.0)
+        with contextlib.suppress(OSError):  # the server has hung up already, and its socket is closed: the next receive says so
+            connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(seconds), int(fraction * 1e6)))
+        return connection
+
+    def _ask(self, message: Any) -> tuple[Any, int]:
+        if self._connection is None:
+            raise RemoteError(f"{self.url}: not connected")
+        end = time.monotonic() + self._timeout
+        frame = pack(message)
+        try:
+            self._connection.send(frame)
+        except ConnectionClosed as error:
+            full = isinstance(error.__cause__, BlockingIOError)  # what SO_SNDTIMEO makes of a full buffer
+            raise self._fail(f"took no message within {self._timeout:g} s" if full else f"closed the connection ({error})") from None
+        return self._decode(self._receive(end), "answer"), len(frame)
+
+    def _receive(self, end: float) -> str | bytes:
+        if self._connection is None:
+            raise RemoteError(f"{self.url}: not connected")
+        try:
+            return self._connection.recv(timeout=max(0.001, end - time.monotonic()))
+        except TimeoutError:
+            raise self._fail(f"no answer within {self._timeout:g} s") from None
+        except (ConnectionClosed, OSError) as error:
+            raise self._fail(f"closed the connection ({error})") from None
+
+    def _decode(self, frame: str | bytes, what: str) -> Any:
+        if isinstance(frame, str):
+            # openpi sends a whole traceback; its last line is the error.
+            lines = frame.strip().splitlines() or [""]
+            raise self._fail(f"reported an error: {lines[-1][:300]}")
+        try:
+            return unpack(frame)
+        except ProtocolError as error:
+            raise self._fail(f"its {what} is unreadable: {error}") from None
+
+    def _fail(self, reason: str) -> RemoteError:
+        self.close()
+        return RemoteError(f"{self.url}: {reason}")
+
+
+def _cameras(observation: Observation) -> tuple[str, ...]:
+    return tuple(key.removeprefix(IMAGES) for key in observation if key.startswith(IMAGES))
+
+
+def _is_loopback(url: str) -> bool:
+    host = urlsplit(url).hostname or ""
+    with contextlib.suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"

@@ -1,0 +1,161 @@
+"""A remote policy as the episode loop sees it: real answers of a real server, with delays drawn on a virtual clock."""
+
+import contextlib
+import os
+import time
+
+from osel_sim.errors import RemoteError, UsageError
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.policy.base import Observation
+from osel_sim.policy.call import Call
+from osel_sim.policy.mapping import message_of
+from osel_sim.remote.client import Answer, RemoteClient
+from osel_sim.remote.network import Delays, NetworkModel, NetworkProfile, profile
+from osel_sim.remote.process import PolicyServerProcess
+from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, example_observation, select_observation
+
+DEADLINE = "deadline"
+OUTAGE = "outage"
+
+
+class RemotePolicy:
+    """Client, network model and deadline of one remote policy; a `Caller`.
+
+    A call whose virtual time passes the deadline failed: the robot waited for as long as the deadline and has nothing. It failed because of an
+    `outage` if it would have been in time without one. A server that is dead or breaks the protocol looks the same from the robot: nothing until the
+    deadline. After that the rest of the episode's calls fail as well; the next `reset` tries again.
+
+    Args:
+        spec: a policy file with a `[remote]` table.
+        client: not yet connected, or connected.
+        network: None takes the profile that the policy file names.
+        server: process to start again when it died and to stop at the end; None for a server that somebody else runs.
+
+    Raises:
+        UsageError: `spec` is not remote.
+    """
+
+    def __init__(
+        self, spec: PolicySpec, client: RemoteClient, network: NetworkProfile | None = None, server: PolicyServerProcess | None = None
+    ) -> None:
+        if spec.remote is None:
+            raise UsageError(f"{spec.file}: is not a remote policy")
+        self._spec, self._remote, self._client, self._server = spec, spec.remote, client, server
+        self._profile = network or profile(spec.remote.network)
+        self._network = NetworkModel(self._profile, ())
+        self._broken: str | None = "no episode was started"
+
+    def reset(self, instruction: str, seed: tuple[int, ...]) -> None:
+        """Start a new episode, on a new connection if the last one broke. A server that cannot be reached makes the calls fail, not this."""
+        self._network = NetworkModel(self._profile, seed)
+        self._broken = None
+        may_be_stale = self._client.connected or self._server is not None
+        try:
+            try:
+                self._client.reset(instruction)
+            except RemoteError:
+                if not may_be_stale:
+                    raise
+                self._replace_client()
+                self._client.reset(instruction)
+        except RemoteError as error:
+            self._broken = self._reason(error)
+
+    def call(self, observation: Observation) -> Call:
+        """Actions after the drawn delays, or why there are none."""
+        start = time.perf_counter()
+        answer = self._ask(observation)
+        measured = time.perf_counter() - start
+        # Drawn for failed calls as well, so that the next call's luck does not depend on this one's.
+        sizes = (answer.bytes_up, answer.bytes_down) if answer else (0, 0)
+        delays = self._network.delays(sizes[0], self._spec.inference_seconds, sizes[1])
+        megabytes = 1e-6 * sum(sizes)
+        deadline = self._remote.deadline
+        if answer is None:
+            return Call(None, upload=deadline, measured_seconds=measured, failure=self._broken)
+        if delays.total > deadline:
+            upload, inference, download = _cut(delays, deadline)
+            failure = OUTAGE if delays.total - delays.outage <= deadline else DEADLINE
+            return Call(None, upload, inference, download, megabytes, measured, failure)
+        return Call(answer.actions, delays.upload, delays.inference, delays.download, megabytes, measured)
+
+    def close(self) -> None:
+        """Hang up, and stop the server if it is ours."""
+        self._client.close()
+        if self._server is not None:
+            self._server.close()
+
+    def _replace_client(self) -> None:
+        """After a failed reset: a fresh connection, and a fresh server where it is ours, dead or hanging alike."""
+        self._client.close()
+        if self._server is not None:
+            self._server.close()
+            self._client = self._server.start_client()
+
+    def _ask(self, observation: Observation) -> Answer | None:
+        if self._broken is not None:
+            return None
+        try:
+            return self._client.act(select_observation(observation, self._spec.cameras))
+        except RemoteError as error:
+            self._broken = self._reason(error)
+            return None
+
+    def _reason(self, error: RemoteError) -> str:
+        # Without the address: a server of ours has another port each time, and a journal must not.
+        return str(error).removeprefix(f"{self._client.url}: ")
+
+
+def open_remote(spec: PolicySpec, timeout: float = 30.0, start_timeout: float = 120.0) -> RemotePolicy:
+    """A remote policy ready for use: connects to the `url` of its file, with the token in OSEL_SIM_TOKEN, or starts a server of its own.
+
+    Close it after use.
+
+    Args:
+        timeout: real seconds for one answer.
+        start_timeout: real seconds for a server to load its weights, or for one that is not ours to answer its first request.
+
+    Raises:
+        RemoteError: the server cannot be started or reached.
+        UsageError: `spec` is not remote.
+    """
+    if spec.remote is None:
+        raise UsageError(f"{spec.file}: is not a remote policy")
+    if spec.remote.url is not None:
+        client = RemoteClient(spec.remote.url, os.environ.get(TOKEN_VARIABLE), timeout, Greeting.of(spec), spec.mapping)
+        client.connect()
+        if client.foreign:
+            client.close()
+            # A server that compiles its model with the first request takes long for it.
+            _try_mapping(spec, RemoteClient(spec.remote.url, os.environ.get(TOKEN_VARIABLE), start_timeout, mapping=spec.mapping))
+        return RemotePolicy(spec, client)
+    with contextlib.ExitStack() as undo:
+        server = PolicyServerProcess(spec, timeout, start_timeout)
+        undo.callback(server.close)
+        client = server.start_client()
+        client.connect()
+        undo.pop_all()
+    return RemotePolicy(spec, client, server=server)
+
+
+def _try_mapping(spec: PolicySpec, client: RemoteClient) -> None:
+    """Ask a server that is not ours once, so that a wrong mapping is found now and explained, instead of failing every episode."""
+    example = example_observation(Greeting.of(spec))
+    try:
+        with client:
+            length = len(client.act(example).actions)
+    except RemoteError as error:
+        sent = ", ".join(
+            f"{key} ({value.dtype} {value.shape})" if hasattr(value, "shape") else f"{key} (text)"
+            for key, value in message_of(example, spec.mapping, spec.cameras).items()
+        )
+        raise RemoteError(f"{spec.file}: the server does not take what the file's [mapping] gives it: {error}; it was sent {sent}") from None
+    if length < spec.execute:
+        raise RemoteError(f"{spec.file}: the server's chunks hold {length} actions, execute = {spec.execute}")
+
+
+def _cut(delays: Delays, deadline: float) -> tuple[float, float, float]:
+    """The three parts of a wait that ended at the deadline."""
+    upload = min(delays.upload, deadline)
+    inference = min(delays.inference, deadline - upload)
+    return upload, inference, deadline - upload - inference

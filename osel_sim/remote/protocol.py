@@ -1,0 +1,165 @@
+"""What policy server and client say to each other.
+
+As in openpi (websocket_policy_server.py): the server greets with a metadata map, then answers each observation map with a map that holds `actions`
+(T, 7); a text message is an error. On top of that a server of ours says so in its greeting (`protocol`), and then understands `{"osel_sim/reset":
+instruction}`, answered with the same map. A client without that word works as well: a session starts over by itself when the observation's `task`
+changes.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from osel_sim.errors import OselError, UsageError
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.policy.base import ACTION_DIM, STATE_DIM, Observation
+from osel_sim.remote.codec import ProtocolError
+
+PROTOCOL = "osel_sim/1"
+RESET = "osel_sim/reset"
+TOKEN_VARIABLE = "OSEL_SIM_TOKEN"  # the environment variable that holds a token
+HEALTH = "/healthz"
+MAX_INSTRUCTION = 2000  # characters
+IMAGES = "observation.images."
+STATE = "observation.state"
+TASK = "task"
+
+
+class ObservationError(OselError):
+    """An observation does not have the form the policy's file promises."""
+
+
+@dataclass(frozen=True)
+class Greeting:
+    """What a server of ours says first."""
+
+    policy: str
+    cameras: tuple[str, ...]
+    image_size: int
+    action_dim: int = ACTION_DIM
+    state_dim: int = STATE_DIM
+
+    @classmethod
+    def of(cls, spec: PolicySpec) -> "Greeting":
+        """The greeting of the server of one policy file."""
+        return cls(spec.name, spec.cameras, spec.image_size)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The metadata map as it is sent."""
+        return {
+            "protocol": PROTOCOL,
+            "policy": self.policy,
+            "cameras": list(self.cameras),
+            "image_size": self.image_size,
+            "action_dim": self.action_dim,
+            "state_dim": self.state_dim,
+            "reset": RESET,
+        }
+
+    @classmethod
+    def parse(cls, metadata: Any) -> "Greeting | None":
+        """Read a metadata map; None for a server that only speaks plain openpi.
+
+        Raises:
+            ProtocolError: it is no map, or a greeting of ours that we cannot work with.
+        """
+        if not isinstance(metadata, dict):
+            raise ProtocolError(f"the greeting must be a map, got {type(metadata).__name__}")
+        protocol = metadata.get("protocol")
+        if not (isinstance(protocol, str) and protocol.startswith("osel_sim/")):
+            return None
+        if protocol != PROTOCOL:
+            raise ProtocolError(f"the server speaks {protocol[:40]!r}, this client {PROTOCOL!r}")
+        policy, cameras, size = (metadata.get(key) for key in ("policy", "cameras", "image_size"))
+        if (
+            not isinstance(policy, str)
+            or not isinstance(cameras, list)
+            or not all(isinstance(item, str) for item in cameras)
+            or type(size) is not int
+        ):
+            raise ProtocolError("the greeting lacks policy, cameras or image_size")
+        if metadata.get("action_dim") != ACTION_DIM or metadata.get("state_dim") != STATE_DIM:
+            raise ProtocolError(f"the server's actions and states must have {ACTION_DIM} and {STATE_DIM} numbers")
+        return cls(policy, tuple(cameras), size)
+
+
+def select_observation(observation: Observation, cameras: tuple[str, ...]) -> Observation:
+    """Only what goes over the wire: the policy's own cameras, state and task.
+
+    Raises:
+        ObservationError: one of them is missing.
+    """
+    keys = [*(IMAGES + camera for camera in cameras), STATE, TASK]
+    missing = [key for key in keys if key not in observation]
+    if missing:
+        raise ObservationError(f"the observation lacks {', '.join(missing)}")
+    return {key: observation[key] for key in keys}
+
+
+def check_observation(value: Any, greeting: Greeting) -> Observation:
+    """An observation as it came over the wire, checked.
+
+    Raises:
+        ObservationError: naming the key and what would be right.
+    """
+    if not isinstance(value, dict):
+        raise ObservationError(f"an observation must be a map, got {type(value).__name__}")
+    expected = {*(IMAGES + camera for camera in greeting.cameras), STATE, TASK}
+    if value.keys() != expected:
+        got = ", ".join(sorted(str(key)[:60] for key in list(value)[:20])) or "none"
+        raise ObservationError(f"expected the keys {', '.join(sorted(expected))}, got {got}")
+    shape = (greeting.image_size, greeting.image_size, 3)
+    for camera in greeting.cameras:
+        _array(value, IMAGES + camera, ("uint8",), shape)
+    with np.errstate(over="ignore"):
+        state = _array(value, STATE, ("float32", "float64"), (greeting.state_dim,)).astype(np.float32)
+    if not np.isfinite(state).all():
+        raise ObservationError(f"{STATE} contains NaN or infinity")
+    return {**value, STATE: state, TASK: check_instruction(value[TASK])}
+
+
+def check_instruction(value: Any) -> str:
+    """An instruction as it came over the wire.
+
+    Raises:
+        ObservationError: it is no string or too long.
+    """
+    if not isinstance(value, str):
+        raise ObservationError(f"an instruction must be a string, got {type(value).__name__}")
+    if len(value) > MAX_INSTRUCTION:
+        raise ObservationError(f"an instruction has at most {MAX_INSTRUCTION} characters, got {len(value)}")
+    return value
+
+
+def example_observation(greeting: Greeting) -> Observation:
+    """Zeros in the right form: to warm a policy up, and for tests."""
+    size = greeting.image_size
+    images = {IMAGES + camera: np.zeros((size, size, 3), np.uint8) for camera in greeting.cameras}
+    return {**images, STATE: np.zeros(greeting.state_dim, np.float32), TASK: "pick up the can"}
+
+
+def largest_observation(greeting: Greeting) -> int:
+    """Bytes of the largest message a client may send, with room for a longer one to be answered instead of cut off."""
+    return 2 * len(greeting.cameras) * 3 * greeting.image_size**2 + (1 << 20)
+
+
+def check_token(token: str) -> str:
+    """A token that fits into an HTTP header.
+
+    Raises:
+        UsageError: it does not.
+    """
+    if not re.fullmatch(r"[\x21-\x7e]{8,256}", token):
+        raise UsageError("a token must be 8 to 256 printable ASCII characters without spaces")
+    return token
+
+
+def _array(value: Observation, key: str, dtypes: tuple[str, ...], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
+    array = value[key]
+    if not isinstance(array, np.ndarray):
+        raise ObservationError(f"{key} must be an array, got {type(array).__name__}")
+    if array.dtype.name not in dtypes or array.shape != shape:
+        raise ObservationError(f"{key} must be {' or '.join(dtypes)} of shape {shape}, got {array.dtype.name} of shape {array.shape}")
+    return array

@@ -1,0 +1,203 @@
+"""Replay a rollout log to selectors: `python -m osel_sim.replay assets/logs/pick_place`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from osel_sim import cli
+from osel_sim.errors import UnknownNameError, UsageError
+
+if TYPE_CHECKING:
+    from osel_sim.formats.replay_result import Choices
+    from osel_sim.offline.live import LiveLog
+    from osel_sim.offline.log import LoggedOutcomes
+    from osel_sim.selection.reward import RewardWeights
+
+COSTS = "expected_costs"
+"""Setting of selectors that take what policies cost from what is declared of them, rather than learn it."""
+
+EXAMPLES = """examples:
+  python -m osel_sim.replay assets/logs/pick_place                                   # every selector there is, 20 seeds
+  python -m osel_sim.replay assets/logs/pick_place --selectors ppo ucb1 --preset waymo --out runs/ppo
+  python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500
+  python -m osel_sim.replay runs/pick_place-ppo-s0                                   # a live run: off-policy estimates from its propensities
+
+Shows the log's instances in random orders without replacement to every selector, which sees only the outcome of its choice, and says how far each
+stays from the oracles and whether routing is worth it. Fixed policies, the best and the worst of them, and the oracles are always included.
+Instances on which some policy has no valid outcome are left out and counted. The result does not depend on --workers.
+
+Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv. Of a live run's folder it estimates what each
+fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes."""
+
+
+@cli.main
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command; the exit code."""
+    options = parser().parse_args(arguments)
+    from osel_sim.formats.replay_result import check_folder
+    from osel_sim.offline.live import is_live_run, read_live
+    from osel_sim.offline.log import read_log
+
+    selectors = choose_selectors(options.selectors)
+    folder: Path = options.out or Path("runs") / f"replay-{options.log.resolve().name}"
+    check_folder(folder, options.overwrite)
+    if not is_live_run(options.log):
+        _replay(options, folder, selectors, read_log(options.log, options.encoder), *_weights(options))
+    else:
+        live = read_live(options.log, options.encoder)
+        weights, preset = _weights(options, live.reward)
+        found = _off_policy(options, live, weights)
+        if live.has_all_outcomes(weights):
+            _replay(options, folder, selectors, live.outcomes, weights, preset, found)
+        else:
+            _write_off_policy(folder, found)
+    print(f"written to {folder}")
+    return 0
+
+
+def parser() -> cli.Parser:
+    """Flags of the command."""
+    result = cli.Parser("replay", "Replay a rollout log to selectors: how far from the oracle is each, and is routing worth it?", EXAMPLES)
+    add = result.add_argument
+    add("log", type=cli.folder, metavar="LOG", help="folder of a rollout log, or of a live run")
+    add("--selectors", nargs="+", metavar="NAME", help="ppo, ucb1, auto ... (default: all there are)")
+    add("--policies", nargs="+", metavar="NAME", help="policies to choose from (default: all of the log)")
+    add("--seeds", type=cli.positive_int, default=20, metavar="N", help="number of random orders (default: %(default)s)")
+    add("--decisions", type=cli.positive_int, metavar="N", help="length of a stream (default: all instances)")
+    add("--half", choices=("choose", "score"), help="only this half of the instances: one to choose settings by, the other to report (default: all)")
+    add("--preset", metavar="NAME", help="reward weights of the paper: mmlu, waymo, alfred, oxe (default: oxe)")
+    add("--alpha-time", type=cli.non_negative_float, metavar="A", help="weight of time in the reward (default: the preset's)")
+    add("--alpha-price", type=cli.non_negative_float, metavar="A", help="weight of the price in cents (default: the preset's)")
+    add("--time-unit", choices=("log10-seconds", "steps"), help="of time in the reward (default: the preset's)")
+    add("--success", choices=("success", "subgoals", "score"), help="what counts as success in the reward (default: the preset's)")
+    add("--unknown-costs", action="store_true", help="let all selectors learn what policies cost (default: auto is told, as it is declared)")
+    add("--encoder", metavar="NAME", help="whose contexts, where the log has several (default: the one it was recorded with)")
+    add("--workers", type=cli.positive_int, default=2, metavar="W", help="processes (default: %(default)s)")
+    add("--out", type=Path, metavar="DIR", help="where to write (default: runs/replay-LOG)")
+    add("--overwrite", action="store_true", help="replace a replay that is in --out")
+    return result
+
+
+def _replay(
+    options: argparse.Namespace,
+    folder: Path,
+    selectors: Sequence[str],
+    log: "LoggedOutcomes",
+    weights: "RewardWeights",
+    preset: str | None,
+    off_policy: "dict[str, Any] | None" = None,
+) -> None:
+    """Replay, write and print."""
+    from osel_sim.formats.replay_result import write_replay
+    from osel_sim.offline.oracles import oracles
+    from osel_sim.offline.result import build, tables, with_fixed
+    from osel_sim.offline.streams import complete_instances
+    from osel_sim.offline.tables import print_replay
+    from osel_sim.runtime.tables import console
+
+    if options.policies:
+        log = log.only(options.policies)
+    others = log
+    if options.half:
+        log, others = log.take(log.half(options.half)), log.take(~log.half(options.half))
+    costs = None if options.unknown_costs else others.expected_costs(weights)
+    log, left_out = complete_instances(log, weights)
+    if left_out.instances:
+        print(f"warning: {left_out.instances} instances without an outcome of every policy are left out", file=sys.stderr)
+    best = oracles(log, weights)
+    choices = with_fixed(_replay_all(log, weights, selectors, costs, options), best)
+    result = build(log, weights, preset, choices, best, left_out, range(options.seeds))
+    result["log"]["half"] = options.half
+    result["off_policy"] = off_policy
+    result["expected_costs"] = costs
+    write_replay(folder, result, choices, tables(result))
+    print_replay(console(), result)
+
+
+def _off_policy(options: argparse.Namespace, live: "LiveLog", weights: "RewardWeights") -> dict[str, Any]:
+    """Estimates from a live run's propensities, printed."""
+    from osel_sim.offline.evaluation import evaluate
+    from osel_sim.offline.tables import print_off_policy
+    from osel_sim.runtime.tables import console
+
+    if options.policies or options.half:
+        raise UsageError("--policies and --half are for rollout logs: a live run is evaluated as it was made")
+    found = evaluate(live, weights)
+    print_off_policy(console(), found)
+    return found
+
+
+def _write_off_policy(folder: Path, found: dict[str, Any]) -> None:
+    from osel_sim.formats.replay_result import write_off_policy
+
+    write_off_policy(folder, found)
+    print("The run has the outcomes of what was chosen only, so selectors cannot be replayed on it; run it with --counterfactual for that.")
+
+
+def _replay_all(
+    log: "LoggedOutcomes", weights: "RewardWeights", selectors: Sequence[str], costs: "dict[str, float] | None", options: argparse.Namespace
+) -> "Choices":
+    """Run the replays, with a progress bar.
+
+    Args:
+        costs: of each policy, for those selectors that want to know them beforehand; None: for none.
+    """
+    from tqdm import tqdm  # type: ignore[import-untyped]
+
+    from osel_sim.offline.engine import replay
+    from osel_sim.selection.registry import setting_names
+
+    told = (
+        {name: {COSTS: costs} for name in selectors if COSTS in setting_names(name)} if costs is not None and set(costs) == set(log.policies) else {}
+    )
+    decisions = len(log) if options.decisions is None else options.decisions
+    with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
+        return replay(log, weights, selectors, range(options.seeds), options.decisions, options.workers, told, bar.update)
+
+
+def choose_selectors(names: Sequence[str] | None) -> list[str]:
+    """Names of selectors to replay: those given, each once, else all that are installed. Fixed policies are left out: they are always added.
+
+    Raises:
+        UnknownNameError: no such selector.
+        UsageError: it needs a package that is not installed.
+    """
+    from osel_sim.offline.result import REFERENCES
+    from osel_sim.selection.registry import selector_locations
+    from osel_sim.selection.vowpal import available
+
+    locations = selector_locations()
+    if names is None:
+        # `auto` is another name of one of them, which need not run twice.
+        twins = {name for name, place in locations.items() if place == locations.get("auto") and name != "auto"}
+        names = sorted(name for name in locations if name not in twins and (available() or not name.startswith("vw_")))
+    for name in names:
+        kind = name.partition(":")[0]
+        if kind not in locations and name not in REFERENCES:
+            raise UnknownNameError("selector", name, {*locations, *REFERENCES} - {"fixed"})
+        if name.startswith("vw_") and not available():
+            raise UsageError(f"selector {name!r} needs the package vowpalwabbit: pip install 'osel-sim[vw]'")
+    return [name for name in dict.fromkeys(names) if name.partition(":")[0] != "fixed" and name not in REFERENCES]
+
+
+def _weights(options: argparse.Namespace, recorded: "dict[str, Any] | None" = None) -> "tuple[RewardWeights, str | None]":
+    """Weights of the reward, and the preset's name where they are a preset's.
+
+    Args:
+        recorded: of a live run, which count where no preset is named.
+    """
+    from dataclasses import replace
+
+    from osel_sim.run import DEFAULT_PRESET
+    from osel_sim.selection.reward import PRESETS, RewardWeights, preset
+
+    base = RewardWeights(**recorded) if recorded and options.preset is None else preset(options.preset or DEFAULT_PRESET)
+    given = {key: getattr(options, key) for key in ("alpha_time", "alpha_price", "time_unit", "success")}
+    weights = replace(base, **{key: value for key, value in given.items() if value is not None})
+    return weights, next((name for name, known in PRESETS.items() if known == weights), None)
+
+
+if __name__ == "__main__":
+    sys.exit(main(None))

@@ -1,0 +1,254 @@
+"""Section IV of the paper on a log, as figures and tables: clusters, what context is worth, trivial weights, frontiers."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.offline.clusters import Cluster, Clustering, Inequality, describe, find_clusters, inequality
+from osel_sim.offline.estimate import mean_of
+from osel_sim.offline.frontier import frontiers, selector_frontier
+from osel_sim.offline.log import Array, LoggedOutcomes, mean_over_repeats
+from osel_sim.offline.weights_map import TrivialRange, trivial_ranges, weights_map
+from osel_sim.reporting.description import Bars, Cell, Column, Figure, Heat, Line, Mark, Panel, Points, Table, colours
+from osel_sim.reporting.tables import to_text
+from osel_sim.selection.reward import PRESETS, RewardWeights
+
+WHY_DIFFERENT = (
+    "The paper's formula gives the local side 1 \u2212 p_FS, which counts what both fail as local successes and charges local no time, and gives the "
+    "remote side p_FS alone, which leaves out what both solve; the plain expectation is the mean reward of each policy."
+)
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What the frontier shows of selectors.
+
+    Attributes:
+        points: success, seconds and price of each at the weights given.
+        colour: of each.
+        sweep: those to replay at other weights too.
+        told: whether those that take expected costs are told them.
+    """
+
+    points: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    colour: Mapping[str, str] = field(default_factory=dict)
+    sweep: Sequence[str] = ()
+    told: bool = False
+
+
+class Routing(NamedTuple):
+    """The clusters of a log and what they are worth."""
+
+    clustering: Clustering
+    clusters: list[Cluster]
+    inequality: Inequality
+    ranges: list[TrivialRange]
+
+
+def analyse(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[np.bool_]) -> Routing:
+    """Find the clusters and say what they are worth.
+
+    Raises:
+        DataError: too few instances for clusters, or none with an outcome of every policy.
+    """
+    clustering = find_clusters(log.contexts)
+    return Routing(
+        clustering,
+        describe(log, clustering, weights, remote),
+        inequality(log, clustering.labels, weights, remote),
+        trivial_ranges(log, clustering.labels, weights, remote),
+    )
+
+
+def cluster_blocks(log: LoggedOutcomes, routing: Routing) -> list[str | Figure | Table]:
+    """Clusters with their outcome rates and optimal actions, and the paper's inequality."""
+    return [_cluster_figure(log, routing), _cluster_table(log, routing), _inequality_table(routing), WHY_DIFFERENT]
+
+
+def weights_blocks(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[np.bool_], routing: Routing) -> list[str | Figure | Table]:
+    """Where routing is trivial, as a map over both weights and as ranges of each."""
+    found = weights_map(log, routing.clustering.labels, weights, remote)
+    x, y, xs, ys = "alpha_time", "alpha_price (per cent)", found.alpha_time, found.alpha_price
+    here = Points("these weights", [weights.alpha_time], [weights.alpha_price], "ink", ["these weights"], size=13, symbol="star")
+    others = [
+        (name, other)
+        for name, other in PRESETS.items()
+        if other.time_unit == weights.time_unit and xs[0] <= other.alpha_time <= xs[-1] and ys[0] <= other.alpha_price <= ys[-1]
+    ]
+    marks: list[Mark] = [
+        Points(f"preset {name}", [other.alpha_time], [other.alpha_price], "muted", [f"preset {name}"], symbol="diamond") for name, other in others
+    ]
+    inside = xs[0] <= weights.alpha_time <= xs[-1] and ys[0] <= weights.alpha_price <= ys[-1]
+    points = [*marks, here] if inside else marks
+    near = np.outer(_within_a_decade(ys, weights.alpha_price), _within_a_decade(xs, weights.alpha_time))
+    most = max(float(found.gain[near].max() if near.any() else found.gain.max()), 1e-3)
+    who = Heat("instances to a remote policy (%)", xs, ys, 100 * found.remote_share, "diverging", 0, 100)
+    gain = Heat(f"mean reward gained (up to {most:.2g} or more)", xs, ys, found.gain, "sequential", 0, most)
+    panels = [
+        Panel("who serves the clusters", x, y, [who, *points], True, True),
+        Panel("what routing by cluster adds", x, y, [gain, *points], True, True),
+    ]
+    caption = (
+        "Left: all blue and all red are the trivial regions, where every cluster wants a local or a remote policy. Right: best policy of each "
+        "cluster minus best policy of all, chosen and scored on the same instances. Star: the weights of this report; diamonds: the paper's presets."
+    )
+    return [Figure("weights_map", "When is routing trivial?", caption, panels), _ranges_table(weights, routing.ranges)]
+
+
+def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routing, replayed: Replayed) -> Figure:
+    """Success against seconds and against price as a weight sweeps."""
+    tables = {name: _policy_means(getattr(log, name)) for name in ("success", "seconds", "price")}
+    own = colours(log.policies)
+    panels = []
+    for found, against, label in zip(routing.ranges, ("seconds", "price"), ("mean seconds", "mean price (cents)"), strict=True):
+        if not np.isfinite(tables[against]).any():
+            continue  # a log from elsewhere without times, or prices
+        other = "alpha_price" if found.axis == "alpha_time" else "alpha_time"
+        marks: list[Mark] = []
+        for frontier, dash in zip(frontiers(log, routing.clustering.labels, weights, found.axis, found.limit), (True, False), strict=False):
+            x, texts = getattr(frontier, against), [f"{found.axis} {value:.3g}" for value in frontier.weights]
+            marks.append(Line(frontier.name, x, 100 * frontier.success, "ink", dash=dash, dots=True, texts=texts))
+        for column, policy in enumerate(log.policies):
+            if np.isfinite(tables[against][column]):
+                marks.append(
+                    Points(f"always {policy}", [tables[against][column]], [100 * tables["success"][column]], own[policy], size=11, symbol="diamond")
+                )
+        for name in replayed.sweep:
+            line = selector_frontier(log, weights, name, found.axis, found.limit, replayed.told)
+            texts = [f"{name}, {found.axis} {value:.3g}" for value in line.weights]
+            marks.append(Line(name, getattr(line, against), 100 * line.success, replayed.colour.get(name, "muted"), dots=True, texts=texts))
+        for name, values in replayed.points.items():
+            if against in values and "success" in values:
+                marks.append(Points(name, [values[against]], [100 * values["success"]], replayed.colour.get(name, "muted"), size=9))
+        title = f"{found.axis} from 0 to {found.limit:.2g}, {other} = {getattr(weights, other):g}"
+        panels.append(Panel(title, label, "success (%)", marks))
+    caption = (
+        "Lines: what the hindsight oracle, and the best policy of each cluster (chosen on one half of the instances, scored on the other), come to "
+        "as one weight sweeps. Up and to the left is better. Selectors: the last quarter of their streams, a dot at these weights, and a line "
+        "where they were replayed at other weights as well (--frontier)."
+    )
+    return Figure("frontier", "Frontier: success against time and price", caption, panels)
+
+
+def _cluster_figure(log: LoggedOutcomes, routing: Routing) -> Figure:
+    names = [_cluster_name(cluster) for cluster in routing.clusters]
+    colour = colours(log.policies)
+    rewards: list[Mark] = [Bars(policy, names, [cluster.rewards[policy] for cluster in routing.clusters], colour[policy]) for policy in log.policies]
+    parts = (
+        ("both", "both succeed", "c2"),
+        ("only_local", "only local", "c0"),
+        ("only_remote", "only remote", "c1"),
+        ("neither", "neither", "muted"),
+    )
+    rates: list[Mark] = [
+        Bars(label, names, [100 * getattr(cluster.rates, key).value for cluster in routing.clusters], shade) for key, label, shade in parts
+    ]
+    scores = routing.clustering.silhouettes
+    best = routing.clustering.count
+    search: list[Mark] = [
+        Line("silhouette", list(scores), list(scores.values()), "c4"),
+        Points("taken", [best], [scores[best]] if best in scores else [max(scores.values())], "c1", size=11, symbol="star"),
+    ]
+    panels = [
+        Panel("mean reward", "", "mean reward", rewards),
+        Panel("outcome rates", "", "episodes (%)", rates, stacked=True, y_range=(0.0, 100.0)),
+        Panel("number of clusters", "clusters", "mean silhouette", search),
+    ]
+    caption = "k-means in the leading components of the context, with the number of clusters of the highest silhouette. Largest cluster first."
+    return Figure("clusters", "Clusters in the context", caption, panels)
+
+
+def _cluster_table(log: LoggedOutcomes, routing: Routing) -> Table:
+    policies = list(log.policies)
+    rows: list[dict[str, Cell]] = [
+        {
+            **{"cluster": cluster.number, "about": cluster.about, "instances": cluster.instances, "share": cluster.share},
+            **{f"p_{key}": getattr(cluster.rates, key).value for key in ("both", "only_local", "only_remote", "neither")},
+            **{f"reward_{policy}": cluster.rewards[policy] for policy in policies},
+            "best": cluster.best,
+            **{
+                "paper_local": cluster.paper_local,
+                "paper_remote": cluster.paper_remote,
+                "paper_best": "remote" if cluster.paper_remote_best else "local",
+            },
+        }
+        for cluster in routing.clusters
+    ]
+    columns = [
+        *(Column("cluster", "cluster"), Column("about", "mostly", "text"), Column("instances", "instances"), Column("share", "share ρ", "percent")),
+        *(Column("p_both", "p_SS", "percent"), Column("p_only_local", "p_SF", "percent"), Column("p_only_remote", "p_FS", "percent")),
+        Column("p_neither", "p_FF", "percent"),
+        *(Column(f"reward_{policy}", f"reward of {policy}", digits=3) for policy in policies),
+        Column("best", "optimal action", "text"),
+        *(Column("paper_local", "paper: 1 \u2212 p_FS", digits=3), Column("paper_remote", "paper: p_FS \u2212 penalties", digits=3)),
+        Column("paper_best", "paper: action", "text"),
+    ]
+    caption = "Outcome rates: first letter local, second remote, S success, F failure. Only instances on which every policy has an outcome."
+    return Table("clusters", "Optimal action of each cluster", caption, columns, rows)
+
+
+def _inequality_table(routing: Routing) -> Table:
+    found = routing.inequality
+    columns = [
+        *(
+            Column("formula", "computed as", "text"),
+            Column("contextual", "contextual", digits=4),
+            Column("non_contextual", "non-contextual", digits=4),
+        ),
+        Column("difference", "difference", digits=4),
+    ]
+    rows: list[dict[str, Cell]] = [
+        {
+            "formula": "plain expectation, same instances",
+            **{"contextual": found.contextual, "non_contextual": found.non_contextual, "difference": found.size},
+        },
+        {"formula": "plain expectation, held out", "contextual": None, "non_contextual": None, "difference": found.held_out},
+        {
+            "formula": "paper's formula (1 \u2212 p_FS)",
+            **{"contextual": found.paper_contextual, "non_contextual": found.paper_non_contextual},
+            "difference": found.paper_contextual - found.paper_non_contextual,
+        },
+    ]
+    caption = (
+        "Converged mean reward of the best policy of each cluster against the best policy of all (paper, section IV). On the same instances the "
+        "difference cannot be negative; held out, one half of the instances chooses and the other scores, so that it can. With a 95% interval."
+    )
+    return Table("inequality", "What context is worth once all is learnt", caption, columns, rows)
+
+
+def _ranges_table(weights: RewardWeights, ranges: list[TrivialRange]) -> Table:
+    number = Column("", "", digits=4)
+    rows: list[dict[str, Cell]] = []
+    for found in ranges:
+        other = "alpha_price" if found.axis == "alpha_time" else "alpha_time"
+        rows.append(
+            {
+                **{"weight": found.axis, "here": float(getattr(weights, found.axis)), "kept": f"{other} = {getattr(weights, other):g}"},
+                "remote": "never" if found.all_remote_below is None else f"0 to {to_text(found.all_remote_below, number)}",
+                "local": f"not up to {found.limit:.3g}" if found.all_local_above is None else f"from {to_text(found.all_local_above, number)}",
+            }
+        )
+    columns = [
+        *(Column("weight", "weight", "text"), Column("here", "in this report", digits=4), Column("kept", "other weight kept at", "text")),
+        *(Column("remote", "every cluster remote", "text"), Column("local", "every cluster local", "text")),
+    ]
+    caption = "Between the two ranges some clusters want a local and some a remote policy, and a contextual selector has something to gain."
+    return Table("trivial_weights", "Ranges in which routing is trivial", caption, columns, rows)
+
+
+def _policy_means(values: Array) -> Array:
+    """Mean of each policy, (P,), of what is known; NaN of nothing."""
+    means = [mean_of(mean_over_repeats(values[:, column])) for column in range(values.shape[1])]
+    return np.array([np.nan if mean is None else mean.value for mean in means])
+
+
+def _within_a_decade(values: Array, of: float) -> NDArray[np.bool_]:
+    return (values >= of / 10.0) & (values <= of * 10.0)
+
+
+def _cluster_name(cluster: Cluster) -> str:
+    about = cluster.about.split(" (")[0]
+    return f"{cluster.number}" if about == "mixed" else f"{cluster.number} {about}"

@@ -1,0 +1,120 @@
+"""The page of a rollout log, and the sections that the pages of replays and live runs share with it."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from osel_sim.errors import DataError
+from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.offline.clusters import complete_instances
+from osel_sim.offline.estimate import Estimate
+from osel_sim.offline.log import LoggedOutcomes, read_log
+from osel_sim.offline.outcomes import remote_policies
+from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, cluster_blocks, frontier_figure, weights_blocks
+from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
+from osel_sim.reporting.log_sections import context_figure, formula, policy_blocks, rates_table, time_figure
+from osel_sim.reporting.page import Block, Page, Section, Tile, Verdict
+from osel_sim.selection.reward import RewardWeights
+
+
+def log_page(folder: Path, weights: RewardWeights, scenes: Scenes = no_scenes) -> Page:
+    """The page of a rollout log: what its policies came to, and whether there is something to route by.
+
+    Args:
+        scenes: draws how some of its instances begin.
+
+    Raises:
+        DataError: no log there, or it lacks what the weights ask for.
+    """
+    log = read_log(folder)
+    sections, routing = log_sections(log, weights)
+    title = f"{few(sorted(set(log.labels('task'))))}: {len(log):,} instances, {len(log.policies)} policies"
+    rows, _ = read_rollouts(folder)
+    episodes = list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes(log))
+    return Page("Rollout log", title, _verdict(log, weights, routing), sections, log_facts(log, weights), episodes)
+
+
+def log_sections(log: LoggedOutcomes, weights: RewardWeights, replayed: Replayed | None = None) -> tuple[list[Section], Routing | None]:
+    """Policies, clusters, weights, frontier, contexts and times of a log; and the clusters, None where there is too little for them.
+
+    Args:
+        replayed: selectors that stand on the frontier.
+    """
+    policies: list[Block] = [formula(weights) + ".", *policy_blocks(log, weights)]
+    routing, reason = None, ""
+    several = len(log.policies) > 1
+    if several:
+        remote, why = remote_policies(log)
+        rates = rates_table(log, remote, why)
+        policies += [rates] if rates else []
+        try:
+            routing = analyse(log, weights, remote)
+        except DataError as error:
+            reason = str(error)
+    times = time_figure(log)
+    sections = [Section("policies", "Policies", [*policies, *([times] if times else [])])]
+    if routing is not None:
+        frontier = frontier_figure(log, weights, routing, replayed or Replayed())
+        sections += [
+            Section("weights", "Time, price and success", [*weights_blocks(log, weights, remote, routing), frontier]),
+            Section("clusters", "What the context tells", cluster_blocks(log, routing)),
+        ]
+    elif several:
+        sections.append(Section("clusters", "What the context tells", [f"Not looked at: {reason}."]))
+    contexts = context_figure(log, weights)
+    if contexts is not None:
+        sections.append(Section("contexts", "Contexts", [contexts]))
+    return sections, routing
+
+
+def log_facts(log: LoggedOutcomes, weights: RewardWeights) -> list[tuple[str, str]]:
+    """What a log was made from."""
+    facts = [
+        *(("log", str(log.source)), ("tasks", ", ".join(sorted(set(log.labels("task"))))), ("policies", ", ".join(log.policies))),
+        *(("instances", f"{len(log):,}"), ("repeats", str(log.repeats)), ("encoder", log.encoder), ("reward", formula(weights))),
+    ]
+    return facts + [(name, digest[:12]) for name, digest in dict(log.metadata.get("content") or {}).items()]
+
+
+def few(names: Sequence[str], most: int = 3) -> str:
+    """`a, b, c and 11 more`."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def signed(value: float, digits: int = 3) -> str:
+    """`+0.012`, `−0.100`."""
+    return f"{value:+.{digits}f}".replace("-", "\u2212")
+
+
+def interval(estimate: Estimate) -> str:
+    """`[−0.010, 0.020]`."""
+    return bounds(estimate.low, estimate.high)
+
+
+def bounds(low: float, high: float) -> str:
+    """`[−0.010, 0.020]`."""
+    return f"[{low:.3f}, {high:.3f}]".replace("-", "\u2212")
+
+
+def _verdict(log: LoggedOutcomes, weights: RewardWeights, routing: Routing | None) -> Verdict:
+    rewards = log.mean_rewards(weights)[complete_instances(log, weights)]
+    means = rewards.mean(axis=0)
+    best, oracle = int(means.argmax()), float(rewards.max(axis=1).mean())
+    success = float(np.nanmean(log.success[:, best]))
+    tiles = [
+        Tile("best single policy", log.policies[best], f"mean reward {means[best]:.3f}"),
+        Tile("its success", f"{100 * success:.0f}%"),
+        Tile("hindsight oracle", f"{oracle:.3f}", "mean reward; optimistic, not learnable where outcomes are noisy"),
+    ]
+    held_out = routing.inequality.held_out if routing else None
+    sentences = [f"Always {log.policies[best]} has the highest mean reward; knowing each outcome beforehand would add {oracle - means[best]:.3f}."]
+    if held_out is None:
+        return Verdict(f"Best single policy: {log.policies[best]}", [*sentences, "There are too few instances to say what context is worth."], tiles)
+    tiles.insert(1, Tile("routing by cluster adds", signed(held_out.value), f"mean reward, held out, 95% {interval(held_out)}"))
+    change = f"{signed(held_out.value)} {interval(held_out)}"
+    by_cluster = f"Choosing by the cluster an instance lies in changes the mean reward by {change} on instances not used to choose"
+    if held_out.low > 0.0:
+        return Verdict("There is something to route by", [*sentences, f"{by_cluster}."], tiles, "good")
+    sentences.append(f"{by_cluster}: no gain can be seen. A replay shows whether a selector that learns finds more.")
+    return Verdict(f"Little to route by: always {log.policies[best]} is hard to beat", sentences, tiles)

@@ -1,0 +1,156 @@
+"""One self-contained HTML page from figures, tables and words, with the figures' PNG and SVG and the tables' CSV beside it."""
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+from osel_sim.errors import UsageError
+from osel_sim.reporting.description import DARK, LIGHT, Figure, Table
+from osel_sim.reporting.tables import to_csv, to_text
+
+PAGE, FIGURES, TABLES = "report.html", "figures", "tables"
+
+Block = str | Figure | Table
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One number of the verdict."""
+
+    label: str
+    value: str
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the page says first.
+
+    Attributes:
+        headline: the answer.
+        sentences: why, and how much is at stake.
+    """
+
+    headline: str
+    sentences: Sequence[str]
+    tiles: Sequence[Tile] = ()
+    tone: Literal["good", "neutral", "bad"] = "neutral"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page.
+
+    Attributes:
+        name: its anchor.
+        blocks: paragraphs, figures and tables in their order.
+    """
+
+    name: str
+    title: str
+    blocks: Sequence[Block]
+
+    @property
+    def named_blocks(self) -> Iterator[tuple[str, Block]]:
+        """Each block with its kind: text, figure, table."""
+        for block in self.blocks:
+            yield "text" if isinstance(block, str) else "figure" if isinstance(block, Figure) else "table", block
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The list of episodes.
+
+    Attributes:
+        note: which they are.
+        data: what report.js reads: policies, instances, episodes by column, videos.
+    """
+
+    note: str
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Page:
+    """All the page says.
+
+    Attributes:
+        kind: what it reports on: a replay, a live run, a rollout log.
+        facts: what it was made from.
+    """
+
+    kind: str
+    title: str
+    verdict: Verdict
+    sections: Sequence[Section]
+    facts: Sequence[tuple[str, str]]
+    episodes: Episodes | None = None
+    figures: Sequence[Figure] = field(init=False)
+    tables: Sequence[Table] = field(init=False)
+
+    def __post_init__(self) -> None:
+        blocks = [block for section in self.sections for block in section.blocks]
+        object.__setattr__(self, "figures", tuple(block for block in blocks if isinstance(block, Figure)))
+        object.__setattr__(self, "tables", tuple(block for block in blocks if isinstance(block, Table)))
+
+
+def write_page(page: Page, folder: Path) -> Path:
+    """Write `figures/`, `tables/` and last `report.html` into a folder. Each file appears at once or not at all, and none if one cannot be made."""
+    from osel_sim.reporting.matplotlib_figures import to_images
+
+    files = {f"{FIGURES}/{figure.name}.{ending}": image for figure in page.figures for ending, image in to_images(figure).items()}
+    files |= {f"{TABLES}/{table.name}.csv": to_csv(table).encode() for table in page.tables}
+    files[PAGE] = to_html(page).encode()
+    for name, content in files.items():
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        partial = file.with_name(f".{file.name}.partial")
+        partial.write_bytes(content)
+        os.replace(partial, file)
+    return folder / PAGE
+
+
+def to_html(page: Page) -> str:
+    """The page. Words from logs are escaped by the template, numbers and names for the script by `_embedded`."""
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    from osel_sim.reporting.plotly_figures import to_plotly
+
+    template = resources.files("osel_sim.reporting") / "template"
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    data = {
+        "palette": {"light": LIGHT, "dark": DARK},
+        "figures": {figure.name: to_plotly(figure) for figure in page.figures},
+        "episodes": page.episodes.data if page.episodes else None,
+    }
+    return environment.from_string((template / "report.html.j2").read_text(encoding="utf-8")).render(
+        page=page,
+        text=to_text,
+        light=LIGHT,
+        dark=DARK,
+        css=Markup((template / "report.css").read_text(encoding="utf-8")),
+        script=Markup((template / "report.js").read_text(encoding="utf-8")),
+        plotly=Markup(_plotly()),
+        data=Markup(_embedded(data)),
+    )
+
+
+def _plotly() -> str:
+    """plotly.js, as the plotly package ships it. Read as a file: importing the package takes a second, and nothing else of it is needed."""
+    import importlib.util
+
+    found = importlib.util.find_spec("plotly")
+    if found is None or found.origin is None:
+        raise UsageError("the report needs the package plotly: pip install plotly")
+    return (Path(found.origin).parent / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
+
+
+def _embedded(data: Mapping[str, Any]) -> str:
+    """JSON that cannot end the script element it stands in, whatever is in it."""
+    text = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

@@ -1,0 +1,203 @@
+"""The page of a replay."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.formats.replay_result import REPLAY, Choices, read_replay
+from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.offline.clusters import score_of
+from osel_sim.offline.live import is_live_run, read_live
+from osel_sim.offline.log import Array, LoggedOutcomes, read_log
+from osel_sim.offline.measures import curves
+from osel_sim.offline.oracles import oracles
+from osel_sim.reporting.cluster_sections import Replayed
+from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
+from osel_sim.reporting.log_page import bounds, few, log_facts, log_sections, signed
+from osel_sim.reporting.off_policy_section import off_policy_table
+from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
+from osel_sim.reporting.replay_tables import SINGLES, gaps, oracle_table, paired_tables, selector_table
+from osel_sim.reporting.selector_sections import (
+    MAIN,
+    ORACLES,
+    Stream,
+    Style,
+    curve_figure,
+    gap_figure,
+    penalty_figure,
+    regret_figure,
+    share_figure,
+    style_of,
+)
+from osel_sim.selection.reward import RewardWeights
+
+_MOST_PICKS = 4
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """What a replay's page can show besides what lies in its folder.
+
+    Attributes:
+        log: where the rollout log now lies; None: where it was when it was replayed.
+        scenes: draws how some of its instances begin.
+        frontier: selectors to replay at other weights.
+    """
+
+    log: Path | None = None
+    scenes: Scenes = no_scenes
+    frontier: Sequence[str] = ()
+
+
+def replay_page(folder: Path, options: ReplayOptions) -> Page:
+    """The page of a replay's folder.
+
+    Raises:
+        DataError: no replay there, or its log is missing or is another one.
+    """
+    result, choices = read_replay(folder)
+    try:
+        return _page(folder, result, choices, options)
+    except (KeyError, TypeError, IndexError) as error:
+        raise DataError(f"{folder / REPLAY}: does not have the promised form ({error!r})") from None
+
+
+def _page(folder: Path, result: Mapping[str, Any], choices: Choices, options: ReplayOptions) -> Page:
+    log = _log(folder, result, choices, options.log)
+    weights = RewardWeights(**{key: value for key, value in result["reward"].items() if key != "preset"})
+    names = _names(result)
+    streams = _streams(log, weights, choices, names)
+    always = {shown: name.removeprefix("fixed:") for name, shown in names.items() if name.startswith("fixed:")}
+    stake = result["verdict"]["stake"]
+    style = style_of(list(streams), log.policies, always, {*_ends(result, names), names.get(str(stake.get("selector")), "")})
+    learners = {shown: streams[shown] for name, shown in names.items() if not name.startswith("fixed:")}
+    learnable = ORACLES[result["learnable_oracle"]["name"]]
+    selectors: list[Block] = [curve_figure(streams, style), selector_table(result, names)]
+    gap = gap_figure({names[name]: gaps(entry) for name, entry in result["selectors"].items() if entry["kind"] == "learner"}, learnable)
+    regret = regret_figure(streams, [*_ends(result, names)[:1], learnable], style)
+    shares = share_figure(learners, log.policies, style)
+    selectors += [block for block in (gap, regret, penalty_figure(streams, style), shares) if block is not None]
+    selectors += [oracle_table(result), *paired_tables(result, names)]
+    selectors += [off_policy_table(result["off_policy"])] if result.get("off_policy") else []
+    points = {shown: _point(streams[shown]) for name, shown in names.items() if not name.startswith("fixed:")}
+    for name in options.frontier:
+        if name not in result["selectors"] or result["selectors"][name]["kind"] == "fixed":
+            raise UnknownNameError("selector", name, [known for known, entry in result["selectors"].items() if entry["kind"] != "fixed"], str(folder))
+    replayed = Replayed(points, style.colour, options.frontier, told=result.get("expected_costs") is not None)
+    shared, _ = log_sections(log, weights, replayed)
+    title = f"{few(result['log']['tasks'])}: {len(learners)} selectors over {choices.order.shape[1]:,} decisions, {len(choices.order)} seeds"
+    episodes = _episodes(log, weights, choices, names, style, options.scenes(log))
+    return Page(
+        "Replay", title, _verdict(result), [Section("selectors", "Selectors", selectors), *shared], _facts(folder, result, log, weights), episodes
+    )
+
+
+def _log(folder: Path, result: Mapping[str, Any], choices: Choices, log_folder: Path | None) -> LoggedOutcomes:
+    """The replayed instances, in the order of the choices."""
+    source = log_folder or Path(result["log"]["folder"])
+    if not source.is_dir():
+        raise UsageError(f"the log {source} that {folder} was replayed from is not there; give its folder with --log")
+    encoder = result["log"]["encoder"]
+    log = (read_live(source, encoder).outcomes if is_live_run(source) else read_log(source, encoder)).only(choices.policies)
+    row = {key: index for index, key in enumerate(log.keys)}
+    missing = [key for key in choices.instances if key not in row]
+    if missing:
+        raise DataError(f"{source}: {len(missing)} instances of {folder / REPLAY} are not in this log, the first of them {missing[0]!r}")
+    return log.take([row[key] for key in choices.instances])
+
+
+def _names(result: Mapping[str, Any]) -> dict[str, str]:
+    """Selector -> what it is called on the page; the best and the worst single policy are fixed policies under a second name, and left out."""
+    entries = result["selectors"]
+    role = {entries[name]["policy"]: word for name, word in zip(SINGLES, ("best single", "worst single"), strict=True) if name in entries}
+
+    def shown(name: str) -> str:
+        policy = name.removeprefix("fixed:")
+        if policy == name:
+            return name
+        return f"always {policy}" + (f" ({role[policy]})" if policy in role else "")
+
+    return {name: shown(name) for name in entries if name not in SINGLES}
+
+
+def _ends(result: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
+    """The best and the worst single policy as the page calls them."""
+    return [names[f"fixed:{result['selectors'][name]['policy']}"] for name in SINGLES if name in result["selectors"]]
+
+
+def _streams(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str]) -> dict[str, Stream]:
+    """What every selector and oracle received in each decision."""
+    rewards = log.rewards(weights)
+    penalties = score_of(log, weights) - rewards
+    tables = [choices.outcomes(table) for table in (rewards, log.success, penalties, log.seconds, log.price)]
+
+    def stream(columns: Array) -> Stream:
+        chosen = columns.astype(np.int64)
+        reward, success, penalty, seconds, price = (np.take_along_axis(table, chosen[:, :, None], axis=2)[:, :, 0] for table in tables)
+        return Stream(reward, success, penalty, seconds, price, chosen)
+
+    streams = {shown: stream(choices.chosen[name].astype(np.float64)) for name, shown in names.items()}
+    found = curves(log, weights, choices, oracles(log, weights))
+    nothing = np.full(choices.order.shape, np.nan)
+    for name, shown in ORACLES.items():
+        if name == "hindsight":
+            best = stream(np.nan_to_num(tables[0], nan=-np.inf).argmax(axis=2).astype(np.float64))
+            streams[shown] = Stream(best.reward, best.success, best.penalty, best.seconds, best.price)
+        elif name in found.oracles:
+            streams[shown] = Stream(found.oracles[name], nothing, nothing, nothing, nothing)
+    return streams
+
+
+def _point(stream: Stream) -> dict[str, float]:
+    """Success, seconds and price over the last quarter of the stream: what it comes to once it has learnt."""
+    late = slice(stream.reward.shape[1] * 3 // 4, None)
+    return {
+        name: float(np.nanmean(values)) for name in ("success", "seconds", "price") if np.isfinite(values := getattr(stream, name)[:, late]).any()
+    }
+
+
+def _verdict(result: Mapping[str, Any]) -> Verdict:
+    found, stake = result["verdict"], result["verdict"]["stake"]
+    route = found["decision"] == "route"
+    headline = f"Route with {found['selector']}" if route else f"Do not route: always use {found['policy']}"
+    text = str(found["text"])
+    for ending in (": ", ". "):
+        text = text.removeprefix(headline + ending)
+    single = result["oracles"]["best_single"]
+    tiles = [Tile("best single policy", found["policy"], f"mean reward {single['mean_reward']:.3f}")]
+    if stake.get("selector"):
+        gain, late = stake["gain"], stake["gain_late"]
+        tiles.append(Tile(f"{stake['selector']} over it", signed(gain), f"reward a decision, bounds {bounds(*stake['gain_bounds'])}"))
+        tiles.append(Tile("in the last quarter", signed(late), f"reward a decision, bounds {bounds(*stake['gain_late_bounds'])}"))
+    learnable = ORACLES[stake["learnable_oracle"]]
+    tiles.append(Tile("learnable gain", signed(stake["learnable_gain"]), f"reward a decision: {learnable}"))
+    return Verdict(headline, [text[:1].upper() + text[1:]], tiles, "good" if route else "neutral")
+
+
+def _facts(folder: Path, result: Mapping[str, Any], log: LoggedOutcomes, weights: RewardWeights) -> list[tuple[str, str]]:
+    left_out = result["log"]["left_out"]["instances"]
+    own = [("replay", str(folder)), ("seeds", str(len(result["seeds"]))), ("decisions a seed", f"{result['decisions']:,}")]
+    own += [("instances left out", f"{left_out:,} without an outcome of every policy")] if left_out else []
+    own += [("half of the instances", str(result["log"]["half"]))] if result["log"].get("half") else []
+    return [*own, ("preset", str(result["reward"].get("preset"))), *log_facts(log, weights)]
+
+
+def _episodes(
+    log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str], style: Style, scenes: Mapping[int, bytes]
+) -> Episodes:
+    rows = [] if is_live_run(log.source) else read_rollouts(log.source)[0]
+    learners = [name for name in names if not name.startswith("fixed:") and name != "random"]
+    kept: Sequence[str] = sorted(learners, key=lambda name: (name not in MAIN, names[name] not in style.shown))[:_MOST_PICKS]
+    return list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes, picks={names[name]: _picks(choices, name) for name in kept})
+
+
+def _picks(choices: Choices, name: str) -> Array:
+    """In which share of its decisions each policy was chosen for each instance, (N, P); NaN for instances that no stream showed."""
+    count = np.zeros((len(choices.instances), len(choices.policies)))
+    np.add.at(count, (choices.order.ravel(), choices.chosen[name].ravel()), 1.0)
+    total = count.sum(axis=1, keepdims=True)
+    return np.where(total > 0, count / np.maximum(total, 1.0), np.nan)

@@ -1,0 +1,119 @@
+"""Tables of a replay."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from osel_sim.offline.estimate import Estimate
+from osel_sim.reporting.description import Cell, Column, Table
+from osel_sim.reporting.selector_sections import ORACLES
+
+SINGLES = ("best_single", "worst_single")
+"""Second names of the fixed policies with the highest and the lowest mean reward."""
+
+
+def gaps(entry: Mapping[str, Any]) -> tuple[Estimate | None, Estimate | None]:
+    """Share of the learnable gap a selector closed, over the whole stream and its last quarter."""
+    return _estimate(entry, "learnable_gap_closed"), _estimate(entry, "learnable_gap_closed_late")
+
+
+def _estimate(entry: Mapping[str, Any], key: str, interval: str | None = None) -> Estimate | None:
+    value, ends = entry.get(key), entry.get(interval or f"{key}_ci95")
+    return None if value is None or ends is None else Estimate(float(value), float(ends[0]), float(ends[1]))
+
+
+def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table:
+    """Every selector, the best first.
+
+    Args:
+        result: of `replay.json`.
+        names: selector -> what it is called on the page.
+    """
+    rows: list[dict[str, Cell]] = []
+    shown = sorted(names, key=lambda name: -float(result["selectors"][name]["mean_reward"]))
+    for name in shown:
+        entry = result["selectors"][name]
+        learns = entry["kind"] == "learner"
+        rows.append(
+            {
+                "selector": names[name],
+                "reward": _estimate(entry, "mean_reward", "ci95"),
+                "success": _estimate(entry, "success_rate", "success_ci95"),
+                **{key: entry[key] for key in ("mean_seconds", "mean_price")},
+                "gap": gaps(entry)[0] if learns else None,
+                "gap_late": gaps(entry)[1] if learns else None,
+                **{f"regret_{oracle}": _of(entry, "regret", oracle) for oracle in result["oracles"] if oracle in ORACLES},
+                "ahead": entry["decisions_until_ahead"] if learns else None,
+            }
+        )
+    columns = [
+        *(Column("selector", "selector", "text"), Column("reward", "mean reward", digits=3), Column("success", "success", "percent")),
+        *(Column("mean_seconds", "seconds"), Column("mean_price", "price (cents)", digits=1)),
+        *(Column("gap", "gap closed", "percent"), Column("gap_late", "last quarter", "percent")),
+        *(Column(f"regret_{oracle}", f"regret to {word}", digits=3) for oracle, word in ORACLES.items() if oracle in result["oracles"]),
+        Column("ahead", "ahead after"),
+    ]
+    caption = (
+        "Means with 95% bootstrap intervals over seeds, the best first. Regret: reward a decision below the oracle. Gap closed: share of the way "
+        "from the best single policy to the learnable oracle. Ahead after: decisions until its rewards pass the best single policy's for good."
+    )
+    return Table("selectors", "What each selector came to", caption, columns, rows)
+
+
+def oracle_table(result: Mapping[str, Any]) -> Table:
+    """The oracles, and what each knows."""
+    meaning = {
+        "hindsight": "best outcome of each decision, known only afterwards: optimistic, not learnable where outcomes are noisy",
+        "expected": "best policy of each instance by its mean over some repeats, scored on the others",
+        "predictable": "best policy by what can be known of an instance (task, object, container, phrasing), chosen on other instances",
+        "per_task": "best policy of each task",
+        "best_single": "best policy over all instances",
+    }
+    rows: list[dict[str, Cell]] = [
+        {"oracle": ORACLES.get(name, name.replace("_", " ")), "reward": entry["mean_reward"], "meaning": meaning.get(name, "")}
+        for name, entry in result["oracles"].items()
+    ]
+    columns = [Column("oracle", "oracle", "text"), Column("reward", "mean reward", digits=3), Column("meaning", "what it is", "text")]
+    learnable = ORACLES[result["learnable_oracle"]["name"]]
+    return Table("oracles", "What could have been", f"The learnable gap is that between the best single policy and the {learnable}.", columns, rows)
+
+
+def paired_tables(result: Mapping[str, Any], names: Mapping[str, str]) -> list[Table]:
+    """Differences of each selector to the best single policy and to the best selector."""
+    learners = [name for name, entry in result["selectors"].items() if entry["kind"] == "learner"]
+    if not learners or not result["paired"]:
+        return []
+    best = max(learners, key=lambda name: float(result["selectors"][name]["mean_reward"]))
+    references = dict.fromkeys([SINGLES[0], best])
+    rows: list[dict[str, Cell]] = []
+    for reference in references:
+        for entry in result["paired"]:
+            if reference not in (entry["a"], entry["b"]):
+                continue
+            other, sign = (entry["a"], 1.0) if entry["b"] == reference else (entry["b"], -1.0)
+            if other in references and reference != SINGLES[0]:
+                continue
+            rows.append(
+                {
+                    "selector": names.get(other, other),
+                    "against": names.get(reference, reference.replace("_", " ")),
+                    "difference": _signed(_estimate(entry, "difference", "ci95"), sign),
+                    "late": _signed(_estimate(entry, "difference_late", "ci95_late"), sign),
+                }
+            )
+    columns = [
+        *(Column("selector", "selector", "text"), Column("against", "against", "text")),
+        *(Column("difference", "difference in reward", digits=4), Column("late", "in the last quarter", digits=4)),
+    ]
+    caption = "Differences on the same streams, with 95% bootstrap intervals over seeds; paired.csv of the replay has all pairs."
+    return [Table("paired_differences", "Paired differences", caption, columns, rows)]
+
+
+def _signed(estimate: Estimate | None, sign: float) -> Estimate | None:
+    if estimate is None or sign > 0:
+        return estimate
+    return Estimate(-estimate.value, -estimate.high, -estimate.low)
+
+
+def _of(entry: Mapping[str, Any], key: str, name: str) -> Estimate | None:
+    value, ends = entry[key].get(name), entry[f"{key}_ci95"].get(name)
+    return None if value is None or ends is None else Estimate(float(value), float(ends[0]), float(ends[1]))

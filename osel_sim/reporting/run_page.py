@@ -1,0 +1,225 @@
+"""The page of a live run."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.errors import DataError
+from osel_sim.formats.journal import Decision, read_journal
+from osel_sim.formats.run_config import RUN, read_json
+from osel_sim.offline.clusters import score_of
+from osel_sim.offline.estimate import Estimate, mean_of, rate_of
+from osel_sim.offline.evaluation import evaluate
+from osel_sim.offline.live import JOURNAL, LiveLog, read_live
+from osel_sim.offline.log import Array, LoggedOutcomes
+from osel_sim.offline.sequential import advantage_bounds
+from osel_sim.reporting.description import Cell, Column, Figure, Line, Mark, Panel, Table, colours, thinned
+from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes
+from osel_sim.reporting.log_page import few, interval, log_sections, signed
+from osel_sim.reporting.log_sections import formula
+from osel_sim.reporting.off_policy_section import off_policy_table
+from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
+from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, penalty_figure, regret_figure, share_figure, style_of
+from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
+
+VIDEOS = "videos"
+HINDSIGHT = ORACLES["hindsight"]
+ERROR = 0.05
+"""Probability, at most, that the bounds of the verdict do not hold."""
+
+
+def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = None) -> Page:
+    """The page of a live run's folder.
+
+    Args:
+        scenes: draws how some of its instances begin.
+        beside: folder of the page, where it is not the run's.
+
+    Raises:
+        DataError: no run there, or no decision in it.
+    """
+    run = _read(folder)
+    selector = run.live.selector
+    streams = _streams(run, selector)
+    style = style_of(list(streams), run.log.policies, {f"always {policy}": policy for policy in run.log.policies})
+    curves: list[Block] = [curve_figure(streams, style)]
+    if HINDSIGHT in streams:
+        curves += [regret_figure(streams, [HINDSIGHT], style), penalty_figure(streams, style)]
+    shares = share_figure({selector: streams[selector]}, run.log.policies, style)
+    curves += [shares] if shares else []
+    curves += [_propensities(run), _chosen_table(run, selector)]
+    if any(decision.reward is not None for decision in run.decisions):
+        curves.append(off_policy_table(evaluate(run.live, run.weights)))
+    sections = [Section("curves", "Learning", curves)]
+    try:
+        sections += log_sections(run.log, run.weights)[0]
+    except DataError as error:  # a run without counterfactual knows too little for some tables
+        sections.append(Section("policies", "Policies", [f"Not looked at: {error}."]))
+    decisions = f"{len(run.decisions)} decision" + ("s" if len(run.decisions) != 1 else "")
+    title = f"{few(sorted(set(run.log.labels('task'))))}: {selector} over {decisions}"
+    return Page("Live run", title, _verdict(run, selector, streams), sections, _facts(run), _episodes(run, scenes(run.log), beside or folder))
+
+
+@dataclass(frozen=True)
+class _Run:
+    """A live run: its journal, its outcomes as arrays, its reward."""
+
+    folder: Path
+    live: LiveLog
+    decisions: Sequence[Decision]
+    weights: RewardWeights
+
+    @property
+    def log(self) -> LoggedOutcomes:
+        return self.live.outcomes
+
+    @property
+    def chosen(self) -> NDArray[np.int64]:
+        return self.live.chosen
+
+    @property
+    def configuration(self) -> Mapping[str, Any]:
+        return self.log.metadata
+
+
+def _read(folder: Path) -> _Run:
+    live = read_live(folder)
+    try:
+        weights = RewardWeights(**live.reward)
+    except TypeError as error:
+        raise DataError(f"{folder / RUN}: configuration.reward does not have the promised form ({error})") from None
+    return _Run(folder, live, read_journal(folder / JOURNAL), weights)
+
+
+def _streams(run: _Run, selector: str) -> dict[str, Stream]:
+    """The selector, and where every policy ran in a decision what each would have received there, and the best of them."""
+    rows, log = np.arange(len(run.chosen)), run.log
+    rewards = log.mean_rewards(run.weights)
+    score = log.success[:, :, 0]
+    penalty = score_of(log, run.weights)[:, :, 0] - rewards
+    tables = np.stack([rewards, score, penalty, log.seconds[:, :, 0], log.price[:, :, 0]])
+
+    def stream(received: Array, chosen: NDArray[np.int64] | None = None) -> Stream:
+        reward, success, lost, seconds, price = received[:, None, :]
+        return Stream(reward, success, lost, seconds, price, chosen)
+
+    streams = {selector: stream(tables[:, rows, run.chosen], run.chosen[None])}
+    complete = np.isfinite(rewards).all(axis=1)
+    if complete.any() and len(log.policies) > 1:
+        for column, policy in enumerate(log.policies):
+            streams[f"always {policy}"] = stream(np.where(complete, tables[:, :, column], np.nan))
+        best = np.where(complete, np.nan_to_num(rewards, nan=-np.inf).argmax(axis=1), 0)
+        streams[HINDSIGHT] = stream(np.where(complete, tables[:, rows, best], np.nan))
+    return streams
+
+
+def _propensities(run: _Run) -> Figure:
+    at = thinned(len(run.decisions))
+    colour = colours(run.log.policies)
+    marks: list[Mark] = []
+    for policy in run.log.policies:
+        marks.append(Line(policy, at + 1, [run.decisions[index].propensities.get(policy, 0.0) for index in at], colour[policy]))
+    caption = "Probability with which the selector would choose each policy, as it stood when it decided. Off-policy estimates build on these."
+    return Figure("propensities", "How sure the selector is", caption, [Panel("", "decision", "propensity", marks, y_range=(-0.02, 1.02))])
+
+
+def _chosen_table(run: _Run, selector: str) -> Table:
+    log, rows = run.log, []
+    rewards = log.mean_rewards(run.weights)
+    parts = [(selector, np.ones(len(run.chosen), bool)), *((f"chose {name}", run.chosen == column) for column, name in enumerate(log.policies))]
+    for name, mine in parts:
+        at = np.flatnonzero(mine), run.chosen[mine]
+        own = [run.decisions[index] for index in at[0].tolist()]
+        row: dict[str, Cell] = {
+            **{"who": name, "decisions": len(own), "errors": sum(item.error is not None for item in own)},
+            "fallbacks": sum(item.fallback is not None for item in own),
+            **{"success": rate_of(log.success[at]), "reward": mean_of(rewards[at])},
+            **{key: mean_of(values[at]) for key, values in (("steps", log.steps), ("seconds", log.seconds), ("price", log.price))},
+        }
+        rows.append(row)
+    columns = [
+        *(Column("who", "", "text"), Column("decisions", "decisions"), Column("errors", "errors"), Column("fallbacks", "fallbacks")),
+        *(Column("success", "success", "percent"), Column("reward", "mean reward", digits=3)),
+        *(Column("steps", "steps", digits=0), Column("seconds", "seconds"), Column("price", "price (cents)", digits=1)),
+    ]
+    caption = "What was received, with 95% intervals; errors are no failures and count nowhere else."
+    return Table("chosen", "What the selector received", caption, columns, rows)
+
+
+def _verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
+    own = streams[selector]
+    reward, success = mean_of(own.reward), rate_of(own.success.T)
+    rate = f"95% [{100 * success.low:.0f}, {100 * success.high:.0f}]" if success else ""
+    tiles = [
+        Tile("mean reward", f"{reward.value:.3f}" if reward else "–", f"95% {interval(reward)}" if reward else ""),
+        Tile("success", f"{100 * success.value:.0f}%" if success else "–", rate),
+        *_mean_tiles(own),
+    ]
+    if HINDSIGHT not in streams:
+        sentence = "What the other policies would have done is not known: run with --counterfactual to compare."
+        return Verdict(f"{selector} received {reward.value:.3f} a decision" if reward else f"{selector} received nothing", [sentence], tiles)
+    fixed = {name: stream for name, stream in streams.items() if name.startswith("always ")}
+    best = max(fixed, key=lambda name: float(np.nanmean(fixed[name].reward)))
+    differences = own.reward - fixed[best].reward
+    differences = differences[np.isfinite(differences)]
+    if not differences.size:
+        return Verdict(f"{selector} cannot be compared", ["No decision has an outcome of both what was chosen and every other policy."], tiles)
+    rewards = run.log.rewards(run.weights)
+    span = float(np.nanmax(rewards) - np.nanmin(rewards))
+    low, high = advantage_bounds(differences, span, ERROR / 2.0) if span > 0.0 else (0.0, 0.0)
+    difference = Estimate(float(differences.mean()), low, high)
+    oracle = float(np.nanmean(streams[HINDSIGHT].reward))
+    tiles.append(Tile(f"over {best}", signed(difference.value), f"reward a decision, 95% {interval(difference)}"))
+    tiles.append(Tile("hindsight oracle", f"{oracle:.3f}", "mean reward; optimistic"))
+    return _compared(selector, best, difference, differences.size, tiles)
+
+
+def _compared(selector: str, best: str, difference: Estimate, compared: int, tiles: list[Tile]) -> Verdict:
+    over = f"{signed(difference.value)} reward a decision over {compared} compared decisions, with 95% confidence within {interval(difference)}"
+    hint = "The bounds allow for a selector that learns as it goes. One run is one stream: osel_sim.replay on a rollout log compares over many."
+    if difference.low > 0.0:
+        return Verdict(f"{selector} is ahead of {best}", [f"{over}.", hint], tiles, "good")
+    if difference.high < 0.0:
+        return Verdict(f"{selector} is behind {best}", [f"{over}: what it paid so far to find out.", hint], tiles, "bad")
+    return Verdict(f"Too early to tell {selector} from {best}", [f"{over}: that may as well be nothing.", hint], tiles)
+
+
+def _mean_tiles(stream: Stream) -> list[Tile]:
+    def mean(values: Array) -> float | None:
+        known = values[np.isfinite(values)]
+        return float(known.mean()) if known.size else None
+
+    seconds, price = mean(stream.seconds), mean(stream.price)
+    tiles = [Tile("seconds an episode", f"{seconds:.1f}")] if seconds is not None and seconds >= FLOOR_SECONDS else []
+    return tiles + ([Tile("cents an episode", f"{price:.1f}")] if price is not None else [])
+
+
+def _facts(run: _Run) -> list[tuple[str, str]]:
+    ran_with = read_json(run.folder / RUN).get("environment", {})
+    own = {key: value for key, value in run.configuration.items() if key not in ("reward", "content")}
+    facts = [("folder", str(run.folder)), *((key, _words(value)) for key, value in own.items()), ("reward", formula(run.weights))]
+    facts += [(name, str(digest)[:12]) for name, digest in dict(run.configuration.get("content") or {}).items()]
+    versions = ", ".join(f"{name} {version}" for name, version in dict(ran_with.get("versions") or {}).items())
+    return [*facts, ("versions", versions), ("git", str(ran_with.get("git"))), ("OpenGL", str(ran_with.get("gl")))]
+
+
+def _words(value: Any) -> str:
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def _episodes(run: _Run, scenes: Mapping[int, bytes], beside: Path) -> Episodes:
+    notes = {
+        (index, int(run.chosen[index]), 0): {"fallback": decision.fallback, "error": decision.error}
+        for index, decision in enumerate(run.decisions)
+        if decision.fallback or decision.error
+    }
+    videos = {}
+    for index, decision in enumerate(run.decisions):
+        file = run.folder / VIDEOS / f"{index:05d}-{decision.policy}.mp4"
+        if file.is_file():
+            videos[index, int(run.chosen[index])] = file
+    return list_episodes(run.log, run.weights, run.chosen, notes, scenes, videos, beside=beside)

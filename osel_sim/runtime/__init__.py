@@ -1,0 +1,1 @@
+"""What the commands that run episodes share: drivers, subscribers, video, the live loop, worker processes."""

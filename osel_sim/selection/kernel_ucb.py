@@ -1,0 +1,69 @@
+"""The selector that the suite recommends, `auto`."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from numpy.typing import ArrayLike
+
+from osel_sim.errors import UsageError
+from osel_sim.selection.bayesian import BayesianSelector
+from osel_sim.selection.features import Landmarks
+
+
+class KernelUCBSelector(BayesianSelector):
+    """Kernel UCB with what matters learned from the evidence: Gaussian-process regression of each policy's success on the context.
+
+    Contexts that lie together share what was learned of a policy, those apart do not, so regions of any shape can be told apart, and the selector
+    begins as a bandit without context and becomes a contextual one as far as the rewards speak for it (see `BayesianSelector`). Where they
+    never do it stays with the best single policy. Declared costs spare it learning time and price; it works without, and with no
+    context seen before.
+
+    Args:
+        policies, context_dim, seed: see `SelectorBase`.
+        expected_costs: policy -> declared alpha_time * time + alpha_price * price, as `osel_sim.costs.expected_costs` gives; None learns them too.
+        warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
+        components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
+        signals, optimism, chance: see `BayesianSelector`. A little chance keeps every propensity above 0 where policies are close.
+
+    Raises:
+        UsageError: a number out of range, or contexts of another form.
+        UnknownNameError: `expected_costs` lacks a policy.
+    """
+
+    name: ClassVar[str] = "kernel_ucb"
+
+    def __init__(
+        self,
+        policies: Sequence[str],
+        context_dim: int,
+        seed: int,
+        *,
+        expected_costs: Mapping[str, float] | None = None,
+        warm_contexts: ArrayLike | None = None,
+        components: int = 32,
+        whitening: float = 0.5,
+        width: float = 0.7,
+        landmarks: int = 64,
+        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8),
+        optimism: float = 1.0,
+        chance: float = 0.1,
+    ) -> None:
+        if components < 1 or landmarks < 1 or not width > 0.0:
+            raise UsageError(f"components and landmarks must be at least 1 and width positive, got {components}, {landmarks}, {width}")
+        self._own = {"components": components, "whitening": whitening, "width": width, "landmarks": landmarks}
+        super().__init__(
+            policies,
+            context_dim,
+            seed,
+            Landmarks(components, whitening, width, landmarks),
+            signals=signals,
+            optimism=optimism,
+            chance=chance,
+            expected_costs=expected_costs,
+            warm_contexts=warm_contexts,
+        )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Those of `BayesianSelector`, and those of the features."""
+        return {**super().settings, **self._own}

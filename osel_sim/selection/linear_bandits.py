@@ -1,0 +1,120 @@
+"""LinUCB and linear Thompson sampling on whitened principal components of the context."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+from numpy.typing import ArrayLike
+
+from osel_sim.errors import UsageError
+from osel_sim.selection.bayesian import BayesianSelector
+from osel_sim.selection.features import Components
+
+
+class LinearSelector(BayesianSelector):
+    """Each policy's reward is linear in the whitened context; policies are learned one by one, as in the bandits' textbook form.
+
+    Args:
+        policies, context_dim, seed: see `SelectorBase`.
+        components: principal components of the contexts seen, each whitened to the same variance.
+        optimism, chance, signals, expected_costs, warm_contexts: see `BayesianSelector`.
+
+    Raises:
+        UsageError: a number out of range, or contexts of another form.
+        UnknownNameError: `expected_costs` lacks a policy.
+    """
+
+    def __init__(
+        self,
+        policies: Sequence[str],
+        context_dim: int,
+        seed: int,
+        *,
+        components: int,
+        optimism: float,
+        chance: float,
+        signals: Sequence[float],
+        expected_costs: Mapping[str, float] | None,
+        warm_contexts: ArrayLike | None,
+    ) -> None:
+        if components < 1:
+            raise UsageError(f"components must be at least 1, got {components}")
+        self.components = components
+        super().__init__(
+            policies,
+            context_dim,
+            seed,
+            Components(components, whitening=1.0),
+            signals=signals,
+            optimism=optimism,
+            chance=chance,
+            expected_costs=expected_costs,
+            warm_contexts=warm_contexts,
+        )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Those of `BayesianSelector`, and the number of components."""
+        return {**super().settings, "components": self.components}
+
+
+class LinUCBSelector(LinearSelector):
+    """Chooses the policy whose reward is highest at `optimism` deviations above its mean (Li et al. 2010). See `LinearSelector` for the arguments."""
+
+    name: ClassVar[str] = "linucb"
+
+    def __init__(
+        self,
+        policies: Sequence[str],
+        context_dim: int,
+        seed: int,
+        *,
+        components: int = 24,
+        optimism: float = 1.0,
+        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8),
+        expected_costs: Mapping[str, float] | None = None,
+        warm_contexts: ArrayLike | None = None,
+    ) -> None:
+        super().__init__(
+            policies,
+            context_dim,
+            seed,
+            components=components,
+            optimism=optimism,
+            chance=0.0,
+            signals=signals,
+            expected_costs=expected_costs,
+            warm_contexts=warm_contexts,
+        )
+
+
+class LinTSSelector(LinearSelector):
+    """Chooses the policy whose reward is highest in a draw from what is believed (Agrawal and Goyal 2013). See `LinearSelector` for the arguments.
+
+    `chance` scales the deviation of the draws. 1 is Thompson sampling proper, which explores more than some thousand decisions repay.
+    """
+
+    name: ClassVar[str] = "lints"
+
+    def __init__(
+        self,
+        policies: Sequence[str],
+        context_dim: int,
+        seed: int,
+        *,
+        components: int = 24,
+        chance: float = 0.5,
+        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8),
+        expected_costs: Mapping[str, float] | None = None,
+        warm_contexts: ArrayLike | None = None,
+    ) -> None:
+        super().__init__(
+            policies,
+            context_dim,
+            seed,
+            components=components,
+            optimism=0.0,
+            chance=chance,
+            signals=signals,
+            expected_costs=expected_costs,
+            warm_contexts=warm_contexts,
+        )

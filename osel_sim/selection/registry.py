@@ -1,0 +1,87 @@
+"""Selectors by name. Listing them imports none: torch and stable-baselines3 come in with the selector that needs them."""
+
+import inspect
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, cast
+
+from osel_sim.errors import UnknownNameError, UsageError
+from osel_sim.selection.protocol import Selector
+
+ENTRY_POINTS = "osel_sim.selectors"
+"""Entry-point group in which other packages offer selectors: `name = "module:Class"`."""
+
+BUILT_IN = {
+    "auto": "osel_sim.selection.kernel_ucb:KernelUCBSelector",
+    "epsilon_greedy": "osel_sim.selection.epsilon_greedy:EpsilonGreedySelector",
+    "fixed": "osel_sim.selection.fixed:FixedSelector",
+    "kernel_ucb": "osel_sim.selection.kernel_ucb:KernelUCBSelector",
+    "lints": "osel_sim.selection.linear_bandits:LinTSSelector",
+    "linucb": "osel_sim.selection.linear_bandits:LinUCBSelector",
+    "neural_linear": "osel_sim.selection.neural_linear:NeuralLinearSelector",
+    "ppo": "osel_sim.selection.ppo:PPOSelector",
+    "ppo_tuned": "osel_sim.selection.ppo_tuned:TunedPPOSelector",
+    "random": "osel_sim.selection.uniform:UniformSelector",
+    "thompson": "osel_sim.selection.thompson:ThompsonSelector",
+    "ucb1": "osel_sim.selection.ucb1:UCB1Selector",
+    "vw_regcb": "osel_sim.selection.vowpal:RegCBSelector",
+    "vw_squarecb": "osel_sim.selection.vowpal:SquareCBSelector",
+}
+
+
+def selector_locations() -> dict[str, str]:
+    """Name -> `module:Class` of every selector, installed plugins included; a plugin cannot replace a built-in one."""
+    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)} | BUILT_IN
+
+
+def make_selector(name: str, policies: Sequence[str], context_dim: int, seed: int, **settings: Any) -> Selector:
+    """Build a selector.
+
+    Args:
+        name: as `selector_locations` lists it, or `fixed:POLICY` for always that policy.
+        policies: names to choose from.
+        context_dim: length of a context.
+        seed: of everything random in it.
+        settings: hyper-parameters of that selector, by keyword.
+
+    Raises:
+        UnknownNameError: no such selector, or `fixed:POLICY` of a policy that is not among `policies`.
+        UsageError: settings this selector does not have.
+    """
+    kind, colon, policy = name.partition(":")
+    locations = selector_locations()
+    if kind not in locations or (colon and kind != "fixed"):
+        raise UnknownNameError("selector", name, locations, "fixed:POLICY for always the same one")
+    if kind == "fixed":
+        if colon:
+            settings = {**settings, "policy": policy}
+        elif "policy" not in settings:
+            raise UsageError(f"selector 'fixed' needs a policy, such as {f'fixed:{policies[0]}' if policies else 'fixed:POLICY'!r}")
+    factory = _factory(locations[kind])
+    known = _settings(factory)
+    for setting in settings:
+        if setting not in known:
+            raise UnknownNameError(f"setting of selector {kind!r}", setting, known)
+    return cast(Selector, factory(policies, context_dim, seed, **settings))
+
+
+def setting_names(name: str) -> list[str]:
+    """Names of the hyper-parameters that a selector takes by keyword.
+
+    Raises:
+        UnknownNameError: no such selector.
+    """
+    kind = name.partition(":")[0]
+    if kind not in selector_locations():
+        raise UnknownNameError("selector", name, selector_locations())
+    return _settings(_factory(selector_locations()[kind]))
+
+
+def _factory(location: str) -> Any:
+    module, _, attribute = location.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def _settings(factory: Any) -> list[str]:
+    return [parameter.name for parameter in inspect.signature(factory).parameters.values() if parameter.kind is parameter.KEYWORD_ONLY]

@@ -1,0 +1,80 @@
+"""Gaussian Thompson sampling: the best of the learners that look at no context."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+
+NODES = 512
+"""Points of each policy's belief at which the probability that it is the best is evaluated."""
+
+
+class ThompsonSelector(SelectorBase):
+    """Chooses each policy with the probability that its mean reward is the highest, by what has been seen.
+
+    The belief about a policy with n rewards is Gaussian: their mean, drawn towards the mean of all rewards by one observation's weight, with
+    variance noise / (n + 1). The noise is the rewards' variance about their policy's mean, pooled over the policies, with one observation of
+    variance 1 to start from. Usually one draws from the beliefs and takes the highest; here the probabilities are integrated numerically and the
+    choice is drawn from them, which is the same, and makes the propensities exact.
+
+    Args:
+        policies, context_dim, seed: see `SelectorBase`. The context is not looked at.
+    """
+
+    name: ClassVar[str] = "thompson"
+
+    def __init__(self, policies: Sequence[str], context_dim: int, seed: int) -> None:
+        super().__init__(policies, context_dim, seed)
+        self._generator = np.random.default_rng(seed)
+        self._counts = np.zeros(len(self.policies), np.int64)
+        self._means = np.zeros(len(self.policies), np.float64)
+        self._squares = 0.0
+
+    def _select(self, context: Context) -> Choice:
+        total = int(self._counts.sum())
+        overall = float((self._counts * self._means).sum() / total) if total else 0.0
+        noise = (1.0 + self._squares) / (1.0 + total)
+        weight = self._counts + 1.0
+        propensities = probability_of_best((self._counts * self._means + overall) / weight, np.sqrt(noise / weight))
+        index = self._generator.choice(len(self.policies), p=propensities)
+        return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
+
+    def _update(self, context: Context, choice: Choice, reward: float) -> None:
+        index = self.policies.index(choice.policy)
+        self._counts[index] += 1
+        before = reward - self._means[index]
+        self._means[index] += before / self._counts[index]
+        self._squares += before * (reward - self._means[index])
+
+    def _add_policy(self, name: str) -> None:
+        self._counts = np.append(self._counts, 0)
+        self._means = np.append(self._means, 0.0)
+
+    def _state(self) -> State:
+        values = {"counts": self._counts.copy(), "means": self._means.copy(), "squares": self._squares}
+        return {**values, "random": self._generator.bit_generator.state}
+
+    def _load(self, state: State) -> None:
+        self._counts, self._means, self._squares = state["counts"].copy(), state["means"].copy(), state["squares"]
+        self._generator.bit_generator.state = state["random"]
+
+
+def probability_of_best(means: NDArray[np.float64], deviations: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Probability of each of several independent Gaussian quantities to be the highest, (P,), to about 1 / `NODES`; they sum to 1.
+
+    Args:
+        means: (P,).
+        deviations: (P,) standard deviations, > 0.
+    """
+    from scipy.special import ndtr, ndtri
+
+    at = ndtri((np.arange(NODES) + 0.5) / NODES)
+    points = means[:, None] + deviations[:, None] * at  # (P, NODES), of equal probability
+    below = ndtr((points[:, None, :] - means[None, :, None]) / deviations[None, :, None])  # (P, P, NODES): point of one, below it the other
+    own = np.arange(len(means))
+    below[own, own] = 1.0
+    probabilities = below.prod(axis=1).mean(axis=1)
+    return np.asarray(probabilities / probabilities.sum(), np.float64)

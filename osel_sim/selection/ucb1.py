@@ -1,0 +1,64 @@
+"""UCB1: the classic non-contextual bandit that explores by optimism."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from osel_sim.errors import UsageError
+from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+
+
+class UCB1Selector(SelectorBase):
+    """Chooses the policy of the highest mean reward so far plus width * sqrt(2 ln t / n) (Auer et al., 2002).
+
+    n counts the policy's rewards, t all of them. Each policy is tried once first; policies with equal indices share the choice.
+
+    Args:
+        policies, context_dim, seed: see `SelectorBase`. The context is not looked at.
+        width: range of the rewards, > 0: 1 for success less small charges.
+
+    Raises:
+        UsageError: `width` is not positive.
+    """
+
+    name: ClassVar[str] = "ucb1"
+
+    def __init__(self, policies: Sequence[str], context_dim: int, seed: int, *, width: float = 1.0) -> None:
+        super().__init__(policies, context_dim, seed)
+        if not width > 0.0:
+            raise UsageError(f"width must be positive, got {width}")
+        self.width = float(width)
+        self._generator = np.random.default_rng(seed)
+        self._counts = np.zeros(len(self.policies), np.int64)
+        self._means = np.zeros(len(self.policies), np.float64)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The width."""
+        return {"width": self.width}
+
+    def _select(self, context: Context) -> Choice:
+        tried = self._counts > 0
+        bonus = self.width * np.sqrt(2.0 * np.log(max(1, int(self._counts.sum()))) / np.maximum(1, self._counts))
+        index = np.where(tried, self._means + bonus, np.inf)
+        best = index == index.max()
+        propensities = best / best.sum()
+        chosen = self._generator.choice(len(self.policies), p=propensities)
+        return Choice(self.policies[chosen], dict(zip(self.policies, propensities.tolist(), strict=True)))
+
+    def _update(self, context: Context, choice: Choice, reward: float) -> None:
+        index = self.policies.index(choice.policy)
+        self._counts[index] += 1
+        self._means[index] += (reward - self._means[index]) / self._counts[index]
+
+    def _add_policy(self, name: str) -> None:
+        self._counts = np.append(self._counts, 0)
+        self._means = np.append(self._means, 0.0)
+
+    def _state(self) -> State:
+        return {"counts": self._counts.copy(), "means": self._means.copy(), "random": self._generator.bit_generator.state}
+
+    def _load(self, state: State) -> None:
+        self._counts, self._means = state["counts"].copy(), state["means"].copy()
+        self._generator.bit_generator.state = state["random"]

@@ -1,0 +1,1 @@
+"""Training of policies from demonstrations: recipe, data cache, batches, loop, evaluation."""

@@ -1,0 +1,82 @@
+"""Where things are in the training images: labels that teach a query to look at what it names.
+
+Without them a policy can guess most positions from its own state (what it carries is where its gripper is) and never learns to look.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+OUT_OF_VIEW = 2.0
+"""Column and row of what a camera does not see, in a dataset: a LeRobotDataset's statistics would not survive NaN."""
+
+
+@dataclass(frozen=True)
+class Pinhole:
+    """A camera, as a dataset's side file gives it.
+
+    Attributes:
+        mount: `world`, or `gripper` if it moves with the grip site.
+        position: (3,), metres in the mount's frame.
+        rotation: (3, 3), columns are the image's right and up and the direction backwards, in the mount's frame.
+        fovy: vertical field of view, degrees; images are square.
+    """
+
+    mount: str
+    position: Array
+    rotation: Array
+    fovy: float
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "Pinhole":
+        """Raises KeyError, TypeError or ValueError for anything else than the promised form."""
+        if data["mount"] not in ("world", "gripper"):
+            raise ValueError(f"mount must be world or gripper, got {data['mount']!r}")
+        rotation = np.array(data["rotation"], np.float64).reshape(3, 3)
+        return cls(data["mount"], np.array(data["position"], np.float64).reshape(3), rotation, float(data["fovy"]))
+
+    def places(self, points: NDArray[np.float32], state: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Column and row (batch, N, 2) in [-1, 1] of world points (batch, N, 3); NaN where a point is out of view.
+
+        Args:
+            state: (batch, 8), of which the grip site's position and axis-angle are used.
+        """
+        offset = points.astype(np.float64)
+        if self.mount == "gripper":
+            rotation = rotation_matrices(state[:, 3:6].astype(np.float64))
+            offset = np.einsum("bji,bnj->bni", rotation, offset - state[:, None, :3])
+        seen = (offset - self.position) @ self.rotation
+        depth = -seen[..., 2] * np.tan(np.radians(self.fovy) / 2)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            places = np.stack([seen[..., 0], -seen[..., 1]], axis=-1) / depth[..., None]
+        hidden = (depth <= 0) | (np.abs(places) > 1).any(axis=-1)
+        places[hidden] = np.nan
+        result: NDArray[np.float32] = places.astype(np.float32)
+        return result
+
+
+def places_in_view(pose: dict[str, Any], points: NDArray[np.float32], state: NDArray[np.float32]) -> NDArray[np.float32]:
+    """What `annotation.places.<camera>` holds for one frame: column and row of each point, one point after the other, (2 * N,).
+
+    Args:
+        pose: the camera's, as it is in this frame (`TaskEnv.camera_pose`).
+        points: (N, 3), world.
+        state: (8,).
+    """
+    places = Pinhole.from_dict(pose).places(points[None], state[None])[0]
+    flat: NDArray[np.float32] = np.nan_to_num(places, nan=OUT_OF_VIEW).reshape(-1)
+    return flat
+
+
+def rotation_matrices(vectors: Array) -> Array:
+    """Axis-angle (batch, 3) -> (batch, 3, 3), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=1)
+    x, y, z = (vectors / np.maximum(angle, 1e-12)[:, None]).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    result: Array = np.eye(3) + np.sin(angle)[:, None, None] * cross + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
+    return result

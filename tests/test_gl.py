@@ -1,0 +1,64 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def run(code: str, **changes: str | None) -> subprocess.CompletedProcess[str]:
+    environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "OSEL_SIM_GL_CHECKED")}
+    environment.update({key: value for key, value in changes.items() if value is not None})
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+
+
+CHOOSE = "import os; from osel_sim.sim import gl; print(gl.find_backend(), os.environ['MUJOCO_GL'], os.environ['PYOPENGL_PLATFORM'])"
+NO_EGL = {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent"}
+
+
+def no_osmesa(folder: Path) -> dict[str, str]:
+    for version in ("", *(f".{number}" for number in range(10))):
+        (folder / f"libOSMesa.so{version}").touch()  # found first, and no library
+    return {"LD_LIBRARY_PATH": str(folder)}
+
+
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_what_the_environment_asks_for_is_used(backend: str) -> None:
+    done = run(CHOOSE, MUJOCO_GL=backend)
+    assert done.stdout.strip() == f"Backend(name='{backend}', how='MUJOCO_GL') {backend} {backend}", done.stderr
+
+
+def test_osmesa_is_found_where_egl_does_not_work() -> None:
+    done = run(CHOOSE, **NO_EGL)
+    assert done.stdout.strip() == "Backend(name='osmesa', how='probed') osmesa osmesa", done.stderr
+
+
+def test_without_any_backend_the_packages_are_named(tmp_path: Path) -> None:
+    done = run(CHOOSE, **NO_EGL, **no_osmesa(tmp_path))
+    assert "DisplayError: no headless OpenGL works" in done.stderr
+    assert "apt-get install libegl1 libgl1-mesa-dri or apt-get install libosmesa6" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("value", "message"), [("eggl", "'eggl' is not a rendering backend, known: egl, osmesa, glfw"), ("egl", "MUJOCO_GL=egl does not work")]
+)
+def test_a_broken_wish_is_refused(value: str, message: str) -> None:
+    done = run(CHOOSE, MUJOCO_GL=value, **NO_EGL)
+    assert done.returncode != 0
+    assert message in done.stderr
+
+
+def test_a_child_process_does_not_probe_again() -> None:
+    done = run("from osel_sim.sim import gl; gl.PROBE_SECONDS = 0.0; print(gl.find_backend())", MUJOCO_GL="egl", OSEL_SIM_GL_CHECKED="egl probed")
+    assert done.stdout.strip() == "Backend(name='egl', how='probed')", done.stderr
+
+
+def test_a_context_comes_from_the_chosen_backend_even_if_mujoco_was_imported_before() -> None:
+    code = "import mujoco; from osel_sim.sim import gl; c = gl.context(8, 8); c.make_current(); print(type(c).__module__); c.free()"
+    assert run(code, MUJOCO_GL=None, **NO_EGL).stdout.strip() == "mujoco.osmesa"
+
+
+def test_robosuite_is_imported_quietly(tmp_path: Path) -> None:
+    # An empty byte-code cache brings out the SyntaxWarnings of a first import.
+    done = run("from osel_sim.sim import gl; print(gl.quiet_robosuite().__version__)", PYTHONPYCACHEPREFIX=str(tmp_path))
+    assert (done.stdout.strip(), done.stderr) == ("1.5.1", "")

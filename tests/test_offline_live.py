@@ -1,0 +1,108 @@
+"""A live run's folder replayed: estimates from its propensities, and a replay where it has every outcome."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from osel_sim import replay
+from osel_sim.context.cache import ContextCache
+from osel_sim.errors import DataError
+from osel_sim.formats.journal import Decision, to_line
+from osel_sim.formats.outcome import Outcome, Seconds
+from osel_sim.formats.replay_result import read_replay
+from osel_sim.formats.run_config import read_json
+from osel_sim.offline.live import is_live_run, read_live
+from osel_sim.selection.reward import RewardWeights
+
+FREE = RewardWeights(0.0, 0.0)
+RATES = {"local": 0.4, "remote": 0.7}
+
+
+def outcome(success: bool, error: str | None = None) -> Outcome:
+    return Outcome(success, float(success), 20, Seconds(motion=1.0), 1, 20, 0.0, error=error)
+
+
+def make_run(folder: Path, decisions: int = 400, counterfactual: bool = False) -> Path:
+    """A run that chose `local` in four of five decisions, whatever the context."""
+    folder.mkdir()
+    generator = np.random.default_rng(0)
+    cache = ContextCache(folder, autosave=0)
+    configuration = {"policies": list(RATES), "selector": "made_up", "encoder": "e@1", "reward": asdict(FREE)}
+    (folder / "run.json").write_text(json.dumps({"schema_version": 1, "configuration": configuration}))
+    journal, others = [], []
+    for index in range(decisions):
+        cache.put("e@1", f"t/test/0/{index}", generator.normal(size=4).astype(np.float32))
+        policy = "local" if generator.random() < 0.8 else "remote"
+        found = {name: outcome(bool(generator.random() < rate)) for name, rate in RATES.items()}
+        if index == 3:
+            found[policy] = outcome(False, "the server died")
+        one = found[policy]
+        about = {
+            "index": index,
+            "task": "t",
+            "axes": None,
+            "phrasing": "train-0",
+            "target": "",
+            "container": "",
+            "seed": index,
+            "level": 0,
+            "split": "test",
+            "instruction": "do it",
+            "policy": policy,
+        }
+        reward = None if one.error else float(one.success)
+        own = {key: value for key, value in vars(one).items()}
+        journal.append(asdict(Decision(**about, propensities={"local": 0.8, "remote": 0.2}, reward=reward, **own)))
+        others.append({"index": index, "policies": {name: {**found[name].to_dict(), "reward": 0.0} for name in found if name != policy}})
+    cache.save()
+    (folder / "episodes.jsonl").write_text("".join(to_line(row) for row in journal))
+    if counterfactual:
+        (folder / "counterfactual.jsonl").write_text("".join(to_line(row) for row in others))
+    return folder
+
+
+def test_estimates_from_the_propensities(tmp_path, capsys):
+    run = make_run(tmp_path / "run")
+    assert is_live_run(run) and not is_live_run(tmp_path)
+    assert replay.main([str(run), "--out", str(tmp_path / "out")]) == 0
+    found = read_json(tmp_path / "out" / "off_policy.json")
+    assert found["run"]["decisions"] == 399 and found["run"]["errors"] == 1 and found["reward"] == asdict(FREE)
+    for policy, rate in RATES.items():
+        entry = found["targets"][f"fixed:{policy}"]
+        for kind in ("ips", "snips", "dr"):
+            low, high = entry[f"{kind}_ci95"]
+            assert low < entry[kind] < high < low + 0.5
+            assert entry[kind] == pytest.approx(rate, abs=high - low)  # twice as far as in 95 of 100 runs
+    assert found["targets"]["fixed:local"]["effective_decisions"] > 250 > found["targets"]["fixed:remote"]["effective_decisions"]
+    printed = capsys.readouterr().out
+    assert "--counterfactual" in printed and "1 decisions that ended in error" in printed
+    assert replay.main([str(run), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_with_all_outcomes_it_is_a_log(tmp_path):
+    run = make_run(tmp_path / "run", 120, counterfactual=True)
+    live = read_live(run)
+    assert live.has_all_outcomes(FREE) and np.isfinite(live.outcomes.success).sum() == 2 * 120 - 1
+    arguments = ["--selectors", "random", "--seeds", "2", "--workers", "1", "--out", str(tmp_path / "out")]
+    assert replay.main([str(run), *arguments]) == 0
+    result, _ = read_replay(tmp_path / "out")
+    assert result["log"]["instances"] == 119 and result["off_policy"]["run"]["decisions"] == 119
+    assert result["reward"]["alpha_time"] == 0.0 and result["verdict"]["policy"] == "remote"
+
+
+def test_damaged_runs_are_refused(tmp_path):
+    run = make_run(tmp_path / "run", 5)
+    text = (run / "episodes.jsonl").read_text()
+    (run / "episodes.jsonl").write_text(text.replace('"policy": "local"', '"policy": "nobody"'))
+    with pytest.raises(DataError, match="'nobody' is no policy of the run"):
+        read_live(run)
+    (run / "episodes.jsonl").write_text("")
+    with pytest.raises(DataError, match="made no decision"):
+        read_live(run)
+    (run / "episodes.jsonl").write_text(text)
+    (run / "counterfactual.jsonl").write_text('{"index": 0, "policies": {"remote": {}}}\n')
+    with pytest.raises(DataError, match=r"counterfactual.jsonl, line 1: not outcomes"):
+        read_live(run)

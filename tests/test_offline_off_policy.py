@@ -1,0 +1,71 @@
+"""Off-policy estimates on a problem whose answer is known."""
+
+import numpy as np
+import pytest
+
+from osel_sim.errors import UsageError
+from osel_sim.offline.off_policy import estimate, forward_model, greedy
+
+RATES = np.array([[0.9, 0.3], [0.2, 0.6]])  # by kind of instance and policy
+VALUES = RATES.mean(axis=0)
+
+
+def problem(seed: int, decisions: int = 600):
+    """A run that mostly chooses policy 0 for either kind. -> contexts, rewards received, chosen, propensities."""
+    generator = np.random.default_rng(seed)
+    kind = generator.integers(2, size=decisions)
+    contexts = np.eye(2)[kind] + 0.1 * generator.normal(size=(decisions, 2))
+    propensities = np.where(kind[:, None] == 0, [0.8, 0.2], [0.7, 0.3])
+    chosen = (generator.random(decisions) > propensities[:, 0]).astype(int)
+    rewards = (generator.random(decisions) < RATES[kind, chosen]).astype(float)
+    return contexts.astype(np.float32), rewards, chosen, propensities
+
+
+@pytest.mark.parametrize("policy", [0, 1])
+def test_unbiased_with_honest_intervals(policy):
+    names, found, covered, widths = ("ips", "snips", "dr"), [], [], []
+    for seed in range(120):
+        contexts, rewards, chosen, propensities = problem(seed)
+        target = np.zeros_like(propensities)
+        target[:, policy] = 1.0
+        result = estimate(rewards, chosen, propensities, target, forward_model(contexts, rewards, chosen, 2))
+        found.append([getattr(result, name) for name in names])
+        intervals = np.array([getattr(result, f"{name}_ci95") for name in names])
+        covered.append((intervals[:, 0] <= VALUES[policy]) & (VALUES[policy] <= intervals[:, 1]))
+        widths.append(intervals[:, 1] - intervals[:, 0])
+    assert np.abs(np.mean(found, axis=0) - VALUES[policy]).max() < 4 * np.std(found, axis=0).max() / np.sqrt(120)
+    assert np.mean(covered, axis=0).min() > 0.88
+    ips, _, dr = np.mean(widths, axis=0)
+    assert dr < 0.9 * ips
+
+
+def test_greedy_by_the_model_beats_every_single_policy():
+    contexts, rewards, chosen, propensities = problem(0, 3000)
+    model = forward_model(contexts, rewards, chosen, 2)
+    result = estimate(rewards, chosen, propensities, greedy(model), model)
+    assert result.dr == pytest.approx(0.75, abs=0.06) and result.dr_ci95[0] > VALUES.max()
+
+
+def test_no_prediction_knows_its_own_reward():
+    contexts, rewards, chosen, _ = problem(0, 200)
+    before = forward_model(contexts, rewards, chosen, 2)
+    changed = rewards.copy()
+    changed[100:] = 7.0
+    assert (forward_model(contexts, changed, chosen, 2)[:101] == before[:101]).all()
+
+
+def test_nothing_is_said_about_what_could_not_have_been_chosen():
+    propensities = np.array([[1.0, 0.0], [0.5, 0.5]])
+    result = estimate([1.0, 0.0], [0, 1], propensities, [[0.0, 1.0], [0.0, 1.0]])
+    assert result.unsupported == 0.5 and result.ips is None and result.dr_ci95 is None
+    same = estimate([1.0, 0.0], [0, 1], propensities, propensities)
+    assert same.ips == same.snips == same.dr == 0.5 and same.effective_decisions == 2.0
+
+
+def test_wrong_input():
+    with pytest.raises(UsageError, match="do not fit"):
+        estimate([1.0], [0], [[0.5, 0.5]], [[1.0]])
+    with pytest.raises(UsageError, match="finite"):
+        estimate([np.nan], [0], [[0.5, 0.5]], [[1.0, 0.0]])
+    with pytest.raises(UsageError, match="no propensity"):
+        estimate([1.0], [0], [[0.0, 1.0]], [[1.0, 0.0]])

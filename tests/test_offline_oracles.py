@@ -1,0 +1,112 @@
+"""Oracles and bounds on problems with known answers."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_log import clusters, make_row, write_log
+
+from osel_sim.errors import DataError, UsageError
+from osel_sim.offline.log import read_log
+from osel_sim.offline.oracles import expected_oracle, oracles
+from osel_sim.offline.sequential import advantage_bounds
+from osel_sim.offline.streams import complete_instances, draw_streams
+from osel_sim.selection.reward import RewardWeights
+
+FREE = RewardWeights(0.0, 0.0)
+
+
+def test_order_and_truth(tmp_path: Path):
+    """hindsight > truth >= expected and predictable > best single; the two come near the truth with many repeats and instances."""
+    made = clusters(tmp_path, instances=1500, clusters=6, dim=8, policies=3, repeats=12, seed=3)
+    log = read_log(tmp_path)
+    found = oracles(log, FREE)
+    hindsight = log.rewards(FREE)[:, :, 0].max(axis=1).mean()
+    assert found.learnable == "expected" and found.expected is not None
+    assert hindsight > made.oracle + 0.1
+    assert made.best_single + 0.05 < found.expected.mean() < made.oracle + 0.02
+    assert found.predictable.mean() == pytest.approx(made.oracle, abs=0.02)
+    assert found.grouping == {"score": ("target",), "choose": ("target",)}
+    assert log.mean_rewards(FREE)[:, found.best_single].mean() == pytest.approx(made.best_single, abs=0.02)
+
+
+def test_luck_is_not_foresight():
+    coins = (np.random.default_rng(0).random((4000, 2, 2)) < 0.5).astype(float)
+    assert coins[:, :, 0].max(axis=1).mean() > 0.7
+    assert expected_oracle(coins).mean() == pytest.approx(0.5, abs=0.03)
+    assert expected_oracle(coins[:, :, :1]) is None
+
+
+def test_groups_that_tell_nothing_are_not_used(tmp_path: Path):
+    generator = np.random.default_rng(1)
+    rows = [
+        make_row(f"i{row}", policy, target=f"t{row % 40}", success=bool(generator.random() < rate))
+        for row in range(400)
+        for policy, rate in (("a", 0.7), ("b", 0.4))
+    ]
+    log = read_log(write_log(tmp_path, rows, {f"i{row}": np.ones(2, np.float32) for row in range(400)}))
+    found = oracles(log, FREE)
+    assert found.learnable == "predictable"
+    best = log.mean_rewards(FREE)[:, 0].mean()
+    assert best - 0.05 < found.predictable.mean() <= best + 1e-9
+
+
+def test_only_complete_instances_are_streamed(tmp_path: Path):
+    rows = [make_row(f"i{row}", policy, repeat) for row in range(5) for policy in "ab" for repeat in range(2)]
+    rows = [row for row in rows if not (row.instance == "i1" and row.policy == "b")]
+    rows += [make_row("i5", "a"), make_row("i5", "b", success=False, error="died")]
+    log = read_log(write_log(tmp_path, rows, {f"i{row}": np.ones(2, np.float32) for row in range(6)}))
+    complete, left_out = complete_instances(log, FREE)
+    assert complete.keys == ("i0", "i2", "i3", "i4")
+    assert (left_out.instances, left_out.by_policy, left_out.errors) == (2, {"a": 0, "b": 2}, 1)
+    with pytest.raises(DataError, match="oracles need"):
+        oracles(log, FREE)
+    with pytest.raises(DataError, match=r"none of 2 instances.*a on 2, b on 0"):
+        complete_instances(log.take([1, 5]), FREE)
+
+
+def test_streams_are_permutations_with_valid_repeats():
+    rewards = np.random.default_rng(0).random((30, 2, 3))
+    rewards[::2, 1, 1] = np.nan
+    streams = draw_streams(rewards, (0, 1, 5))
+    assert streams.order.shape == (3, 30) and streams.repeats.shape == (3, 30, 2)
+    assert all(sorted(order) == list(range(30)) for order in streams.order.tolist())
+    assert np.isfinite(streams.rewards(rewards, 0)).all() and set(np.unique(streams.repeats)) == {0, 1, 2}
+    shorter = draw_streams(rewards, (5,), decisions=7)
+    assert (shorter.order[0] == streams.order[2][:7]).all() and (shorter.repeats[0] == streams.repeats[2][:7]).all()
+    with pytest.raises(UsageError, match="has 30 instances"):
+        draw_streams(rewards, (0,), 31)
+
+
+def test_bounds_hold_and_narrow():
+    generator = np.random.default_rng(0)
+    wrong, widths = 0, []
+    for _ in range(300):
+        differences = generator.choice([-1.0, 0.0, 1.0], p=[0.15, 0.6, 0.25], size=(1, 800))
+        low, high = advantage_bounds(differences, 1.0, 0.05)
+        wrong += (low > 0.1) + (high < 0.1)
+        widths.append(high - low)
+    assert wrong <= 0.1 * 300 + 15
+    assert np.mean(widths) < 0.2
+    # Copies of one order are no new evidence: the bounds stay what they were.
+    assert advantage_bounds(np.repeat(differences, 20, axis=0), 1.0, 0.05) == pytest.approx((low, high))
+    assert advantage_bounds(np.full((2, 3), 0.5), 1.0, 0.05) == (-1.0, 1.0)  # three decisions say nothing
+
+
+def test_bounds_hold_while_it_learns():
+    """The advantage grows from -0.2 to 0.2: what is bounded is its mean over the decisions, 0."""
+    generator = np.random.default_rng(1)
+    rate = np.linspace(0.4, 0.6, 1000)
+    wrong = 0
+    for _ in range(200):
+        low, _ = advantage_bounds(np.where(generator.random(1000) < rate, 1.0, -1.0), 1.0, 0.05)
+        wrong += low > 0.0
+    assert wrong <= 15
+
+
+def test_wrong_input_to_bounds():
+    for bad in ([], [np.nan], [2.0]):
+        with pytest.raises(UsageError):
+            advantage_bounds(bad, 1.0, 0.05)
+    with pytest.raises(UsageError):
+        advantage_bounds([0.1], 1.0, 0.0)

@@ -1,0 +1,157 @@
+"""`python -m osel_sim.record` with real workers and servers: the same bytes however it went, and a dying worker costs one episode."""
+
+import json
+import signal
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
+
+from osel_sim import record
+from osel_sim.context.cache import ContextCache
+from osel_sim.formats.rollout_log import read_rollouts
+
+INSTANCES, REPEATS = 5, 2
+SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        folder = make_world(tmp_path_factory.mktemp("world"))
+        patch.syspath_prepend(str(folder / "plugin"))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def reference(world):
+    folder = world / "two"
+    done = execute(world, "record", *SIZE, "--workers", 2, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in ("rollouts.parquet", "contexts.npz")}
+
+
+def test_every_policy_on_every_instance_from_the_same_state(reference):
+    folder, done = reference
+    rows, metadata = read_rollouts(folder)
+    assert [(row.seed, row.policy, row.repeat) for row in rows] == [
+        (seed, policy, repeat) for seed in range(40, 40 + INSTANCES) for policy in ("calm", "wild") for repeat in range(REPEATS)
+    ]
+    assert all(row.error is None and row.steps == HORIZON and row.target and row.container for row in rows)
+    local = [row for row in rows if row.policy == "calm"]
+    assert all(first.outcome == second.outcome for first, second in zip(local[::2], local[1::2], strict=True)), "nothing random in a local policy"
+    remote = [row for row in rows if row.policy == "wild"]
+    assert len({row.upload for row in remote}) == len(remote), "each episode has its own network"
+    assert metadata["encoder"] == "colours"
+    contexts = ContextCache(folder).table("colours", [row.instance for row in rows[:: 2 * REPEATS]])
+    assert contexts.shape == (INSTANCES, 53)
+    assert len(np.unique(contexts, axis=0)) == INSTANCES
+    assert sorted(file.name for file in folder.iterdir()) == ["contexts.npz", "rollouts.parquet", "run.json"]
+    assert "episodes an hour" in done.stdout
+    assert "success [95%]" in done.stdout
+
+
+def test_one_worker_killed_with_its_parent_and_resumed_by_two_writes_the_same_bytes(world, reference):
+    folder = world / "killed"
+    arguments = [*SIZE, "--out", folder]
+    process = subprocess.Popen(
+        command(world, "record", *arguments, "--workers", 1), env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
+    wait_for_lines(process, folder / "shards.jsonl", 2)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    process.stderr.close()
+    assert not (folder / "rollouts.parquet").exists()
+    done = execute(world, "record", *arguments, "--workers", 2, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert files(folder) == files(reference[0])
+
+
+def test_a_dying_worker_costs_one_episode(world, reference):
+    """The local policy takes its worker along in one of the instances; everything else is as it would have been."""
+    whole, _ = read_rollouts(reference[0])
+    victim = whole[2 * REPEATS]
+    done = execute(world, "record", *SIZE, "--repeats", 1, "--workers", 1, "--out", world / "dying", WANDER_DIES_ON=victim.instruction)
+    assert done.returncode == 0, done.stderr
+    rows, _ = read_rollouts(world / "dying")
+    assert len(rows) == 2 * INSTANCES
+    for row in rows:
+        if (row.seed, row.policy) == (victim.seed, "calm"):
+            assert row.error == "the worker process died (signal 9)"
+            assert not row.success
+        else:
+            assert row in whole
+
+
+def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
+    folder = world / "perturbed"
+    done = execute(world, "record", *SIZE, "--repeats", 1, "--level", 1, "--axis", "camera=3", "--axis", "light=1", "--workers", 1, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    rows, metadata = read_rollouts(folder)
+    assert {(row.level, row.axes) for row in rows} == {(1, "camera=3")}
+    assert {row.instance for row in rows} == {f"short/test/1,camera=3/{seed}" for seed in range(40, 40 + INSTANCES)}
+    assert (metadata["levels"], metadata["axes"]) == ([1], ["camera=3"])
+    clean, _ = read_rollouts(reference[0])
+    assert {(row.level, row.axes) for row in clean} == {(0, None)}
+    before, after = (
+        ContextCache(place).table("colours", [row.instance for row in log if row.policy == "calm" and row.repeat == 0])
+        for place, log in ((reference[0], clean), (folder, rows))
+    )
+    assert (before != after).any(axis=1).all()
+
+
+def test_summary_of_a_log(reference, capsys):
+    assert record.main(["--summary", str(reference[0])]) == 0
+    output = capsys.readouterr().out
+    assert f"{INSTANCES} instances, {2 * INSTANCES * REPEATS} episodes" in output
+    for word in ("calm", "wild", "object", "container", "phrasing", "mean reward"):
+        assert word in output
+
+
+def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
+    arguments = list(map(str, command(world, "record", *SIZE, "--out", reference[0])[3:]))
+    before = files(reference[0])
+    assert record.main([*arguments, "--resume"]) == 0
+    assert "is complete" in capsys.readouterr().out
+    assert files(reference[0]) == before
+
+
+@pytest.mark.parametrize(
+    ("flags", "complaint"),
+    [
+        (["--instances", "0"], "--instances: must be 1 or more, got 0"),
+        (["--workers", "-2"], "--workers: must be 1 or more, got -2"),
+        (["--task", "shrt"], "did you mean 'short'?"),
+        (["--policies", "clam"], "did you mean 'calm'?"),
+        (["--summary", "/nowhere"], "there is no folder /nowhere"),
+        (["--level", "17"], "unknown level 17"),
+        (["--axis", "camra=2"], "did you mean 'camera'?"),
+        (["--axis", "camera"], "must read AXIS=LEVEL"),
+        (["--resume"], "there is no run in"),
+    ],
+)
+def test_wrong_input_gets_one_line(world, capsys, flags, complaint):
+    try:
+        code = record.main([*map(str, command(world, "record", "--out", world / "wrong")[3:]), *flags])
+    except SystemExit as exit:
+        code = exit.code
+    text = capsys.readouterr().err
+    assert code == 2
+    assert complaint in text
+    assert text.count("\n") == 1
+    assert not (world / "wrong").exists()
+
+
+def test_a_used_folder_or_another_recording_is_refused(world, reference, capsys):
+    arguments = list(map(str, command(world, "record", *SIZE, "--out", reference[0])[3:]))
+    assert record.main(arguments) == 2
+    assert "add --resume" in capsys.readouterr().err
+    assert record.main([*arguments, "--resume", "--instances", "6"]) == 2
+    assert "instances was 5 at the beginning, now it is 6" in capsys.readouterr().err
+    assert json.loads((reference[0] / "run.json").read_text())["configuration"]["instances"] == 5

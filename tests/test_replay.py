@@ -1,0 +1,185 @@
+"""`python -m osel_sim.replay`: one log, many selectors, a verdict."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from synthetic_log import clusters, make_row, write_log
+
+from osel_sim import replay
+from osel_sim.errors import DataError
+from osel_sim.formats.replay_result import read_replay
+from osel_sim.offline.engine import replay as replay_all
+from osel_sim.offline.log import read_log
+from osel_sim.selection.reward import RewardWeights
+
+FREE = ["--alpha-time", "0", "--alpha-price", "0", "--workers", "1"]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory) -> Path:
+    """Where context matters a lot: four clusters, three policies."""
+    return clusters(tmp_path_factory.mktemp("log"), instances=600, clusters=4, dim=8, policies=3, seed=5).folder
+
+
+def run(*arguments: object) -> int:
+    return replay.main([str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def replayed(log, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("out") / "replay"
+    assert run(log, "--selectors", "linucb", "thompson", "random", "--seeds", 6, "--out", out, *FREE) == 0
+    return out
+
+
+def test_result(replayed, log):
+    result, choices = read_replay(replayed)
+    json.dumps(result, allow_nan=False)
+    assert result["log"]["instances"] == result["decisions"] == 600 and result["seeds"] == list(range(6))
+    assert set(result["selectors"]) == {
+        "linucb", "thompson", "random", "best_single", "worst_single", "fixed:policy_0", "fixed:policy_1", "fixed:policy_2"
+    }  # fmt: skip
+    table = read_log(log).rewards(RewardWeights(0.0, 0.0))
+    for name, entry in result["selectors"].items():
+        received = choices.received(name, table)
+        assert received.shape == (6, 600) and entry["mean_reward"] == pytest.approx(received.mean())
+        assert entry["ci95"][0] - 1e-9 <= entry["mean_reward"] <= entry["ci95"][1] + 1e-9
+        assert sum(entry["shares"].values()) == pytest.approx(1.0)
+    means = {name: entry["mean_reward"] for name, entry in result["selectors"].items()}
+    oracles = {name: entry["mean_reward"] for name, entry in result["oracles"].items()}
+    assert means["worst_single"] < means["random"] < means["best_single"] == oracles["best_single"] < means["linucb"] < oracles["predictable"] < 1
+    gap = (means["linucb"] - means["best_single"]) / (oracles["predictable"] - means["best_single"])
+    best = result["selectors"]["linucb"]
+    assert best["learnable_gap_closed"] == pytest.approx(gap)
+    assert best["learnable_gap_closed_late"] > best["learnable_gap_closed"] > 0.4
+    assert best["regret"]["hindsight"] == pytest.approx(oracles["hindsight"] - means["linucb"])
+    assert 0 < best["decisions_until_better"] < best["decisions_until_ahead"] < 300
+    assert result["selectors"]["thompson"]["decisions_until_ahead"] is None
+    pair = next(pair for pair in result["paired"] if {pair["a"], pair["b"]} == {"linucb", "thompson"})
+    assert pair["ci95"][0] > 0 or pair["ci95"][1] < 0
+
+
+def test_verdict_is_to_route(replayed):
+    verdict = read_replay(replayed)[0]["verdict"]
+    assert verdict["decision"] == "route" and verdict["selector"] == "linucb"
+    assert verdict["text"].startswith("Route with linucb")
+    low, high = verdict["stake"]["gain_bounds"]
+    assert 0 < low < verdict["stake"]["gain"] < high and verdict["stake"]["success_rate"] > 0
+
+
+def test_tables(replayed):
+    with (replayed / "selectors.csv").open() as file:
+        rows = {row["selector"]: row for row in csv.DictReader(file)}
+    assert float(rows["linucb"]["mean_reward"]) == read_replay(replayed)[0]["selectors"]["linucb"]["mean_reward"]
+    assert len((replayed / "paired.csv").read_text().splitlines()) == 1 + 6
+    assert not list(replayed.glob("*.partial"))
+
+
+def test_verdict_is_not_to_route_where_context_says_nothing(tmp_path: Path):
+    generator = np.random.default_rng(0)
+    rates = (("good", 0.8), ("bad", 0.5))
+    rows = [make_row(f"i{row}", policy, success=bool(generator.random() < rate)) for row in range(400) for policy, rate in rates]
+    folder = write_log(tmp_path / "log", rows, {f"i{row}": generator.normal(size=8) for row in range(400)})
+    assert run(folder, "--selectors", "linucb", "thompson", "ucb1", "--seeds", 3, "--out", tmp_path / "out", *FREE) == 0
+    result, _ = read_replay(tmp_path / "out")
+    assert result["verdict"]["decision"] == "do_not_route" and result["verdict"]["selector"] is None
+    assert result["verdict"]["policy"] == "good" and result["verdict"]["text"].startswith("Do not route: always use good.")
+    assert result["selectors"]["thompson"]["learnable_gap_closed"] is None  # nothing to close
+    assert result["verdict"]["test"]["advantages"]["thompson"]["high"] > result["verdict"]["stake"]["gain"]
+
+
+def test_repeats_missing_outcomes_and_the_half(tmp_path: Path, log):
+    made = clusters(tmp_path / "log", instances=60, clusters=2, dim=4, policies=2, repeats=4)
+    rows = [row for row in _rows(made.folder) if row.instance != "made_up/7" or row.policy != "policy_1"]
+    folder = write_log(tmp_path / "less", rows, {f"made_up/{row}": made.contexts[row] for row in range(60)})
+    assert run(folder, "--selectors", "random", "--seeds", 2, "--out", tmp_path / "out", *FREE) == 0
+    result, choices = read_replay(tmp_path / "out")
+    assert result["log"]["instances"] == 59 and result["log"]["left_out"]["by_policy"] == {"policy_0": 0, "policy_1": 1}
+    assert "made_up/7" not in choices.instances and choices.repeats.max() == 3
+    assert "expected" in result["oracles"] and result["learnable_oracle"]["name"] == "expected"
+    assert run(log, "--half", "score", "--selectors", "random", "--seeds", 2, "--decisions", 50, "--out", tmp_path / "half", *FREE) == 0
+    result, choices = read_replay(tmp_path / "half")
+    assert 250 < result["log"]["instances"] < 350 and choices.order.shape == (2, 50)
+
+
+@pytest.mark.slow
+def test_workers_do_not_matter(log):
+    names = ["ppo_tuned", "linucb", "epsilon_greedy"]
+    outcomes = read_log(log)
+    one, two = (replay_all(outcomes, RewardWeights(0.0, 0.0), names, range(2), 90, workers) for workers in (1, 2))
+    assert (one.order == two.order).all() and all((one.chosen[name] == two.chosen[name]).all() for name in names)
+
+
+def test_a_selector_sees_the_outcomes_of_its_choices_only(log, monkeypatch):
+    outcomes = read_log(log)
+    first = replay_all(outcomes, RewardWeights(0.0, 0.0), ["linucb"], range(1), 100)
+    chosen = np.zeros_like(outcomes.success, bool)
+    rows = first.order[0]
+    chosen[rows, first.chosen["linucb"][0], 0] = True
+    other = read_log(log)
+    other.success[~chosen] = 1.0 - other.success[~chosen]
+    again = replay_all(other, RewardWeights(0.0, 0.0), ["linucb"], range(1), 100)
+    assert (again.chosen["linucb"] == first.chosen["linucb"]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--selectors", "pppo"], "unknown selector 'pppo': did you mean 'ppo'?"),
+        (["--policies", "policy_9"], "unknown policy 'policy_9'"),
+        (["--preset", "mmul"], "unknown reward preset 'mmul': did you mean 'mmlu'?"),
+        (["--decisions", "601"], "--decisions 601: the log has 600 instances"),
+        (["--encoder", "clip"], "no contexts of encoder 'clip'"),
+        (["--half", "all"], "unknown value 'all'"),
+        (["--worker", "1"], "did you mean '--workers'?"),
+    ],
+)
+def test_wrong_input_is_one_line(log, tmp_path, capsys, arguments, message):
+    try:
+        code = run(log, "--seeds", 1, "--out", tmp_path / "out", *arguments)
+    except SystemExit as error:
+        code = error.code
+    assert code == 2
+    complaint = capsys.readouterr().err.strip().splitlines()[-1]
+    assert complaint.startswith("error: ") and message in complaint
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_are_not_replaced_unasked(replayed, log, capsys):
+    assert run(log, "--selectors", "random", "--seeds", 1, "--out", replayed, *FREE) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert run(log, "--selectors", "random", "--seeds", 1, "--out", log, *FREE) == 2
+    assert "not empty" in capsys.readouterr().err
+
+
+def test_damage_is_noticed(log, tmp_path):
+    assert run(log, "--selectors", "random", "--seeds", 1, "--decisions", 9, "--out", tmp_path / "out", *FREE) == 0
+    file = tmp_path / "out" / "choices.npz"
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(DataError, match="damaged"):
+        read_replay(tmp_path / "out")
+
+
+@pytest.mark.slow
+def test_ctrl_c_leaves_nothing_behind(log, tmp_path):
+    command = [sys.executable, "-m", "osel_sim.replay", str(log), "--selectors", "ppo", "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    time.sleep(20)
+    os.kill(process.pid, signal.SIGINT)  # the parent alone: it has to end its workers
+    _, complaints = process.communicate(timeout=60)
+    assert process.returncode == 130 and complaints.strip().endswith("interrupted") and "Traceback" not in complaints
+    assert not (tmp_path / "out").exists()
+
+
+def _rows(folder: Path):
+    from osel_sim.formats.rollout_log import read_rollouts
+
+    return read_rollouts(folder)[0]

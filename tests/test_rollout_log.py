@@ -1,0 +1,189 @@
+"""The rollout log: typed columns, exact values, the same bytes for the same content; shards that survive a cut."""
+
+from dataclasses import replace
+
+import numpy as np
+import pyarrow
+import pyarrow.parquet
+import pytest
+from rich.console import Console
+
+from osel_sim.errors import DataError, UsageError
+from osel_sim.formats.rollout_log import SCHEMA_VERSION, Row, read_rollouts, schema, write_rollouts
+from osel_sim.formats.shards import SHARDS, Shards
+from osel_sim.runtime.rollout_tables import print_rollouts, share_best
+from osel_sim.selection.reward import RewardWeights, logged_reward, preset, reward
+
+COLUMNS = [
+    "task",
+    "instance",
+    "seed",
+    "level",
+    "split",
+    "instruction",
+    "phrasing",
+    "target",
+    "container",
+    "policy",
+    "repeat",
+    "success",
+    "subgoals",
+    "steps",
+    "upload",
+    "inference",
+    "download",
+    "motion",
+    "calls",
+    "actions",
+    "price",
+    "fallback",
+    "error",
+    "score",
+    "axes",
+]
+
+
+def row(seed=0, policy="small", repeat=0, **more):
+    values = {
+        "task": "pick_place",
+        "instance": f"pick_place/test/0/{seed}",
+        "seed": seed,
+        "level": 0,
+        "split": "test",
+        "instruction": "milk, bowl",
+        "phrasing": "held_out-1" if seed % 2 else "train-3",
+        "target": "milk",
+        "container": "bowl",
+        "policy": policy,
+        "repeat": repeat,
+        "success": seed % 2 == 0,
+        "subgoals": 0.1 + 0.2,
+        "steps": 100 + seed,
+        "upload": 0.1,
+        "inference": 0.2,
+        "download": 0.3,
+        "motion": 5.0,
+        "calls": 12,
+        "actions": 96,
+        "price": 3.12,
+        "fallback": None,
+        "error": None,
+    }
+    return Row(**{**values, **more})
+
+
+def test_columns_types_and_schema_version(tmp_path):
+    write_rollouts(tmp_path, [row()], {"task": "pick_place"})
+    table = pyarrow.parquet.read_table(tmp_path / "rollouts.parquet")
+    assert table.schema.names == COLUMNS == schema().names
+    assert table.schema.metadata[b"osel_sim.schema_version"] == str(SCHEMA_VERSION).encode()
+    assert table.schema.field("steps").type == pyarrow.int64()
+    assert table.schema.field("success").type == pyarrow.bool_()
+    assert table.schema.field("fallback").nullable
+
+
+def test_what_goes_in_comes_out_and_equal_logs_are_equal_bytes(tmp_path):
+    rows = [row(seed, policy, repeat, error="died" if seed == 1 else None) for seed in range(3) for policy in ("small", "large") for repeat in (0, 1)]
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write_rollouts(tmp_path / name, iter(rows), {"b": 1, "a": [2]})
+    assert (tmp_path / "a" / "rollouts.parquet").read_bytes() == (tmp_path / "b" / "rollouts.parquet").read_bytes()
+    read, metadata = read_rollouts(tmp_path / "a")
+    assert read == rows
+    assert metadata == {"a": [2], "b": 1, "schema_version": SCHEMA_VERSION}
+    assert read[0].outcome.seconds.download == 0.3
+
+
+def test_wrong_logs_are_refused(tmp_path):
+    with pytest.raises(DataError, match="does not exist"):
+        read_rollouts(tmp_path)
+    (tmp_path / "rollouts.parquet").write_text("no parquet")
+    with pytest.raises(DataError, match="not a Parquet file"):
+        read_rollouts(tmp_path)
+    pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), tmp_path / "rollouts.parquet")
+    with pytest.raises(DataError, match="schema_version must be 1 to 2, got None"):
+        read_rollouts(tmp_path)
+
+
+def test_a_log_of_version_1_is_read_without_scores_and_axes(tmp_path):
+    write_rollouts(tmp_path, [row(), row(policy="large")], {})
+    file = tmp_path / "rollouts.parquet"
+    table = pyarrow.parquet.read_table(file)
+    old = table.drop_columns(["score", "axes"]).replace_schema_metadata({**table.schema.metadata, b"osel_sim.schema_version": b"1"})
+    pyarrow.parquet.write_table(old, file)
+    assert read_rollouts(tmp_path)[0] == [row(), row(policy="large")]
+    pyarrow.parquet.write_table(old.append_column("score", [[0.5, 0.25]]), file)
+    with pytest.raises(DataError, match="columns must be"):
+        read_rollouts(tmp_path)
+    pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"3"}), file)
+    with pytest.raises(DataError, match="schema_version must be 1 to 2, got 3"):
+        read_rollouts(tmp_path)
+    pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"3 or so"}), file)
+    with pytest.raises(DataError, match="metadata cannot be read"):
+        read_rollouts(tmp_path)
+
+
+ELSEWHERE = dict.fromkeys(
+    ["level", "split", "phrasing", "target", "container", "subgoals", "steps", "upload", "download", "motion", "calls", "actions"]
+)
+
+
+def test_a_log_from_elsewhere_may_lack_columns(tmp_path, capsys):
+    rows = [row(seed, policy, score=-0.25, **{**ELSEWHERE, "inference": 2.0}) for seed in range(2) for policy in ("small", "large")]
+    rows = [replace(item, seed=None) for item in rows]
+    write_rollouts(tmp_path, rows, {})
+    read, _ = read_rollouts(tmp_path)
+    assert read == rows
+    with pytest.raises(DataError, match="no episode in simulation: it has no subgoals, steps, upload"):
+        _ = read[0].outcome
+    print_rollouts(Console(width=160), read, preset("oxe"))
+    text = capsys.readouterr().out
+    assert "-0.2500" in text and "steps" not in text and "container" not in text
+
+
+def test_reward_of_logged_rows_by_hand():
+    oxe = preset("oxe")
+    episode = row()
+    assert logged_reward(episode, oxe) == reward(episode.outcome, oxe)
+    assert logged_reward(replace(episode, error="died"), oxe) is None
+    bare = row(score=-0.5, inference=2.0, upload=None, download=None, motion=None, subgoals=None, steps=None)
+    assert logged_reward(bare, replace(oxe, success="score")) == pytest.approx(-0.5 - 0.2 * np.log10(2.0) - 0.01 * 3.12)
+    assert logged_reward(bare, replace(oxe, success="subgoals")) is None
+    assert logged_reward(bare, preset("alfred")) is None
+    assert logged_reward(replace(bare, inference=None, price=None), oxe) is None
+    assert logged_reward(replace(bare, inference=None, price=None), RewardWeights(0.0, 0.0, success="score")) == -0.5
+    with pytest.raises(UsageError, match="has no score"):
+        reward(episode.outcome, replace(oxe, success="score"))
+
+
+def test_shards_come_back_and_a_torn_one_is_dropped(tmp_path):
+    shards = Shards(tmp_path)
+    context = np.linspace(-1, 1, 7, dtype=np.float32) / 3
+    shards.add(5, [row(5), row(5, "large")], context)
+    shards.add(4, [row(4)], None)
+    shards.close(remove=False)
+    file = tmp_path / SHARDS
+    file.write_bytes(file.read_bytes() + b'{"seed": 6, "rows": [')
+    again = Shards(tmp_path)
+    assert again.rows == {5: [row(5), row(5, "large")], 4: [row(4)]}
+    assert list(again.contexts) == [5]
+    assert np.array_equal(again.contexts[5], context)
+    assert again.contexts[5].dtype == np.float32
+    again.close(remove=True)
+    assert not file.exists()
+
+
+def test_tables_leave_errors_out_of_the_rates(capsys):
+    rows = [row(seed, policy) for seed in range(4) for policy in ("small", "large")]
+    rows[0] = row(0, "small", error="died")
+    print_rollouts(Console(width=160), rows, preset("oxe"))
+    text = capsys.readouterr().out
+    assert "4 instances, 8 episodes" in text
+    assert "33% [6, 79]" in text  # 1 of 3
+    assert "50% [15, 85]" in text  # 2 of 4
+    assert "held-out" in text
+
+
+def test_share_best_counts_complete_instances_only():
+    rows = [row(0, "small", price=0.0), row(0, "large"), row(2, "small"), row(2, "large", price=0.0), row(4, "small", error="died"), row(4, "large")]
+    assert share_best(rows, ["small", "large"], preset("oxe")) == {"small": 0.5, "large": 0.5}

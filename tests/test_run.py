@@ -1,0 +1,209 @@
+"""`python -m osel_sim.run` as a user meets it: real processes, a real policy server, and a run that is killed."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
+
+from osel_sim import run
+from osel_sim.formats.journal import read_journal
+
+EPISODES = 6
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        folder = make_world(tmp_path_factory.mktemp("world"))
+        patch.syspath_prepend(str(folder / "plugin"))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def reference(world):
+    """A run that nobody disturbed."""
+    folder = world / "reference"
+    done = execute(world, "run", "--episodes", EPISODES, "--counterfactual", "--out", folder)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    """What must not depend on how a run went."""
+    return {name: (folder / name).read_bytes() for name in ("episodes.jsonl", "counterfactual.jsonl", "summary.json", "contexts.npz")}
+
+
+def test_what_a_run_writes_and_prints(world, reference):
+    folder, done = reference
+    files = "contexts.npz counterfactual.jsonl curve.png episodes.jsonl run.json selector.safetensors summary.json timing.jsonl"
+    page = "figures report.html tables"
+    assert sorted(file.name for file in folder.iterdir()) == sorted(f"{files} {page}".split())
+    assert "mean reward" in done.stdout
+    assert "hindsight oracle" in done.stdout
+    assert "Traceback" not in done.stderr
+    decisions = read_journal(folder / "episodes.jsonl")
+    assert [decision.seed for decision in decisions] == list(range(EPISODES))
+    assert all(decision.error is None and decision.steps == HORIZON for decision in decisions)
+    assert all(sum(decision.propensities.values()) == pytest.approx(1) for decision in decisions)
+    remote = [decision for decision in decisions if decision.policy == "wild"]
+    assert remote, "the untrained selector explores"
+    assert all(decision.seconds.upload > 0 and decision.price > 0 and decision.actions < HORIZON for decision in remote)
+    assert len((folder / "timing.jsonl").read_text().splitlines()) == EPISODES
+
+
+def test_summary_agrees_with_the_journal(reference):
+    folder, _ = reference
+    summary = json.loads((folder / "summary.json").read_text())
+    decisions = read_journal(folder / "episodes.jsonl")
+    others = [json.loads(line)["policies"] for line in (folder / "counterfactual.jsonl").read_text().splitlines()]
+    rewards = [
+        {decision.policy: decision.reward, **{name: item["reward"] for name, item in other.items()}}
+        for decision, other in zip(decisions, others, strict=True)
+    ]
+    assert summary["mean_reward"] == pytest.approx(np.mean([decision.reward for decision in decisions]))
+    assert summary["best_single"] == pytest.approx(max(np.mean([row[name] for row in rewards]) for name in ("calm", "wild")))
+    assert summary["hindsight_oracle"] == pytest.approx(np.mean([max(row.values()) for row in rewards]))
+    assert summary["regret"] == pytest.approx(summary["hindsight_oracle"] - summary["mean_reward"])
+    for name in ("calm", "wild"):
+        part, own = summary["policies"][name], [decision for decision in decisions if decision.policy == name]
+        assert part["decisions"] == len(own)
+        assert part["price"] == pytest.approx(np.mean([decision.price for decision in own]))
+        assert {"success_rate", "mean_reward", "mean_steps", "mean_seconds"} <= part.keys()
+
+
+def test_run_json_holds_what_the_run_depends_on(reference):
+    folder, _ = reference
+    found = json.loads((folder / "run.json").read_text())
+    assert found["configuration"]["reward"] == {"alpha_time": 0.2, "alpha_price": 0.01, "time_unit": "log10-seconds", "success": "success"}
+    assert set(found["configuration"]["content"]) == {"task short", "policy calm", "policy wild"}
+    assert found["environment"]["gl"] in ("egl", "osmesa")
+    assert found["environment"]["versions"]["mujoco"]
+
+
+@pytest.mark.parametrize("trial", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
+def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference, trial):
+    chance = random.Random(trial)
+    folder = world / f"killed-{trial}"
+    arguments = ["--episodes", EPISODES, "--counterfactual", "--out", folder]
+    for attempt in range(1 + trial):
+        flags = [*(["--resume"] if attempt else []), *(["--video", "2"] if attempt == 0 else [])]
+        process = subprocess.Popen(
+            command(world, "run", *arguments, *flags), env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+        )
+        wait_for_lines(process, folder / "episodes.jsonl", 1 + attempt + chance.randrange(3 - trial))
+        time.sleep(chance.random() * 0.5)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        process.stderr.close()
+    assert len(read_journal(folder / "episodes.jsonl")) < EPISODES
+    done = execute(world, "run", *arguments, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert bytes_of(folder) == bytes_of(reference[0])
+
+
+def test_ctrl_c_ends_with_what_there_is(world):
+    folder = world / "interrupted"
+    arguments = command(world, "run", "--episodes", 500, "--out", folder, "--selector", "random")
+    process = subprocess.Popen(arguments, env=environment(world), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    wait_for_lines(process, folder / "episodes.jsonl", 2)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["decisions"] == len(read_journal(folder / "episodes.jsonl")) >= 2
+    assert "random" in output
+
+
+def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):
+    folder, _ = reference
+    for flags, key in ((["--seed", "1"], "seed"), (["--alpha-price", "1"], "reward.alpha_price"), (["--selector", "random"], "selector")):
+        assert user(world, "--episodes", EPISODES, "--counterfactual", "--out", folder, "--resume", *flags) == 2
+        assert f"{key} was" in one_line(capsys)
+
+
+def test_a_dead_server_is_replaced_by_the_local_policy_and_the_journal_says_so(world):
+    """The server dies at its second call, in every episode anew."""
+    done = execute(world, "run", "--episodes", 3, "--selector", "fixed:wild", "--out", world / "crash", WANDER_DIES_ON="server")
+    assert done.returncode == 0, done.stderr
+    decisions = read_journal(world / "crash" / "episodes.jsonl")
+    assert all(decision.fallback and not decision.error for decision in decisions)
+    assert all(decision.seconds.upload > 2.0 and decision.calls == 2 for decision in decisions)  # it waited until the deadline
+    assert json.loads((world / "crash" / "summary.json").read_text())["fallbacks"] == 3
+
+
+@pytest.mark.parametrize(
+    ("flags", "complaint"),
+    [
+        (["--task", "shrt"], "unknown task 'shrt': did you mean 'short'?"),
+        (["--policies", "clam"], "unknown policy 'clam': did you mean 'calm'?"),
+        (["--policies", "calm", "calm"], "named twice"),
+        (["--selector", "pop"], "unknown selector 'pop': did you mean 'ppo'?"),
+        (["--selector", "fixed:clam"], "did you mean 'calm'?"),
+        (["--encoder", "colour"], "unknown encoder 'colour': did you mean 'colours'?"),
+        (["--preset", "waym"], "did you mean 'waymo'?"),
+        (["--episodes", "0"], "--episodes: must be 1 or more, got 0"),
+        (["--alpha-time", "-0.1"], "--alpha-time: must be a number of 0 or more"),
+        (["--level", "17"], "unknown level 17"),
+        (["--axis", "camra=2"], "did you mean 'camera'?"),
+        (["--axis", "camera"], "must read AXIS=LEVEL"),
+        (["--split", "tset"], "did you mean 'test'?"),
+        (["--tasks", "/nowhere"], "there is no folder /nowhere"),
+        (["--resume"], "there is no run in"),
+        (["--episods", "3"], "did you mean '--episodes'?"),
+    ],
+)
+def test_wrong_input_gets_one_line_and_a_suggestion(world, capsys, flags, complaint):
+    try:
+        code = user(world, "--out", world / "wrong", *flags)
+    except SystemExit as exit:
+        code = exit.code
+    assert code == 2
+    assert complaint in one_line(capsys)
+    assert not (world / "wrong").exists()
+
+
+def test_used_out_without_resume_is_refused(world, reference, capsys):
+    assert user(world, "--out", reference[0]) == 2
+    assert "add --resume" in one_line(capsys)
+    (world / "other").mkdir()
+    (world / "other" / "thesis.txt").write_text("years of work")
+    assert user(world, "--out", world / "other", "--selector", "random") == 2
+    assert "is not empty and holds no run.json" in one_line(capsys)
+    assert user(world, "--out", world / "other" / "thesis.txt" / "run") == 2
+    assert "cannot be written: " in one_line(capsys)
+
+
+def user(world: Path, *flags: object) -> int:
+    """The command in this process, where it ends before anything heavy is done."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    return run.main(list(map(str, command(world, "run", *flags)[3:])))
+
+
+def one_line(capsys) -> str:
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    assert text.startswith("error: ")
+    return text
+
+
+def test_tensorboard_files_have_each_decision_once_after_a_resume(world):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="tensorboard is not installed")
+    folder = world / "board"
+    for resume in ([], ["--resume"]):
+        done = execute(world, "run", "--episodes", 3, "--selector", "random", "--tensorboard", "--out", folder, *resume)
+        assert done.returncode == 0, done.stderr
+    events = accumulator.EventAccumulator(str(folder / "tensorboard"))
+    events.Reload()
+    decisions = read_journal(folder / "episodes.jsonl")
+    rewards = events.Scalars("decision/reward")
+    assert [event.step for event in rewards] == [0, 1, 2]
+    assert [event.value for event in rewards] == pytest.approx([decision.reward for decision in decisions], rel=1e-5)
+    assert {"mean/reward", "chosen/calm", "propensity/wild", "decision/price"} <= set(events.Tags()["scalars"])

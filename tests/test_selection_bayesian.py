@@ -1,0 +1,255 @@
+"""LinUCB, linear Thompson sampling, neural-linear and `auto`: they learn what can be learned, and nothing breaks them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from osel_sim.costs import expected_costs
+from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.formats.policy_file import PolicySpec, Price, Remote
+from osel_sim.selection.bayesian import highest
+from osel_sim.selection.features import Components, Landmarks, Sketch
+from osel_sim.selection.kernel_ucb import KernelUCBSelector
+from osel_sim.selection.registry import make_selector
+from osel_sim.selection.reward import RewardWeights
+from osel_sim.selection.state import load_state, save_state
+
+POLICIES = ("a", "b", "c")
+CONTEXTUAL = ("linucb", "lints", "neural_linear", "auto")
+
+
+def clusters(seed: int, decisions: int, dim: int = 40, informative: bool = True):
+    """Six clusters, in each of which one policy succeeds in 9 of 10 and the others in 2 of 10. -> contexts, rewards, success rates."""
+    generator = np.random.default_rng(seed)
+    centres = generator.normal(size=(6, dim))
+    rates = np.full((6, 3), 0.2)
+    rates[np.arange(6), np.arange(6) % 3] = 0.9
+    if not informative:
+        rates[:] = (0.2, 0.7, 0.4)
+    cluster = generator.integers(6, size=decisions)
+    contexts = (centres[cluster] + 0.3 * generator.normal(size=(decisions, dim))).astype(np.float32)
+    return contexts, (generator.random((decisions, 3)) < rates[cluster]).astype(float), rates[cluster]
+
+
+def play(selector, contexts, rewards):
+    """Run the protocol over rows; -> columns chosen."""
+    chosen = []
+    for context, row in zip(contexts, rewards, strict=True):
+        choice = selector.select(context)
+        chosen.append(selector.policies.index(choice.policy))
+        selector.update(context, choice, row[chosen[-1]])
+    return np.array(chosen)
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+def test_learns_which_policy_is_good_where(name):
+    contexts, rewards, rates = clusters(0, 800)
+    chosen = play(make_selector(name, POLICIES, 40, seed=0), contexts, rewards)
+    received = rates[np.arange(800), chosen]
+    assert rates.mean(axis=0).max() < 0.5  # what a single policy can get
+    assert received[-200:].mean() > 0.8
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+def test_where_context_does_not_help_it_finds_the_best_single_policy(name):
+    contexts, rewards, _ = clusters(1, 800, informative=False)
+    selector = make_selector(name, POLICIES, 40, seed=0)
+    chosen = play(selector, contexts, rewards)
+    if name == "neural_linear":  # its network finds features in the noise, and the evidence of the same decisions believes them
+        assert (chosen[-400:] == 1).mean() > 0.8
+    else:
+        assert (chosen[-400:] == 1).mean() > 0.9
+        assert selector.signal < 0.05
+
+
+def test_a_region_that_no_line_cuts_off():
+    """Good inside a ball, bad outside: linear features see nothing of it, landmarks do."""
+    generator = np.random.default_rng(0)
+    contexts = generator.normal(size=(1200, 2)).astype(np.float32)
+    inside = (contexts**2).sum(axis=1) < 1.4
+    rewards = np.stack([inside, ~inside], axis=1).astype(float)
+    late = {}
+    for name in ("linucb", "auto"):
+        chosen = play(make_selector(name, ("in", "out"), 2, seed=0), contexts, rewards)
+        late[name] = rewards[np.arange(1200), chosen][-300:].mean()
+    assert late["auto"] > 0.9
+    assert late["linucb"] < 0.7
+
+
+def test_declared_costs_are_charged():
+    """Two policies equally good: with costs declared the dearer one is tried less from the start."""
+    generator = np.random.default_rng(0)
+    contexts = generator.normal(size=(200, 8)).astype(np.float32)
+    rewards = (generator.random((200, 1)) < 0.6) - np.array([[0.0, 0.3]])
+    declared = make_selector("auto", ("free", "dear"), 8, seed=0, expected_costs={"free": 0.0, "dear": 0.3, "later": 0.1})
+    unknown = make_selector("auto", ("free", "dear"), 8, seed=0)
+    assert (play(declared, contexts, rewards) == 1).sum() <= (play(unknown, contexts, rewards) == 1).sum() <= 60
+    declared.add_policy("later")
+    with pytest.raises(UnknownNameError, match="did you mean 'later'"):
+        declared.add_policy("latter")
+    with pytest.raises(UnknownNameError, match="dear"):
+        make_selector("auto", ("free", "dear"), 8, seed=0, expected_costs={"free": 0.0})
+
+
+def test_contexts_without_outcomes_can_come_first():
+    contexts, rewards, rates = clusters(2, 300)
+    warm = make_selector("auto", POLICIES, 40, seed=0, warm_contexts=contexts)
+    state = warm.state_dict()
+    assert state["features.landmarks"].shape[0] >= 6
+    received = rates[np.arange(300), play(warm, contexts, rewards)]
+    assert received[-100:].mean() > 0.75
+    with pytest.raises(DataError, match="settings"):  # other contexts, other features
+        make_selector("auto", POLICIES, 40, seed=0).load_state_dict(state)
+    with pytest.raises(UsageError, match="warm_contexts"):
+        make_selector("auto", POLICIES, 41, seed=0, warm_contexts=contexts)
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+@pytest.mark.parametrize("stop", [0, 1, 40])
+def test_state_round_trip_is_bit_identical(name, stop, tmp_path):
+    contexts, rewards, _ = clusters(3, 80, dim=300)  # longer than the sketch
+    whole = make_selector(name, POLICIES, 300, seed=5)
+    chosen = play(whole, contexts, rewards)
+    first = make_selector(name, POLICIES, 300, seed=5)
+    play(first, contexts[:stop], rewards[:stop])
+    save_state(first.state_dict(), tmp_path / "state")
+    second = make_selector(name, POLICIES, 300, seed=6)
+    second.load_state_dict(load_state(tmp_path / "state"))
+    assert play(second, contexts[stop:], rewards[stop:]).tolist() == chosen[stop:].tolist()
+    ended, resumed = whole.state_dict(), second.state_dict()
+    assert ended.keys() == resumed.keys()
+    assert all(np.array_equal(ended[key], resumed[key]) for key in ended)
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+def test_seeds_differ(name):
+    contexts, rewards, _ = clusters(4, 60)
+    runs = {tuple(play(make_selector(name, POLICIES, 40, seed=seed), contexts, rewards)) for seed in range(4)}
+    assert len(runs) > 1
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+def test_a_policy_added_late_is_tried_and_taken(name):
+    contexts, rewards, _ = clusters(5, 400, informative=False)
+    selector = make_selector(name, POLICIES[:2], 40, seed=0)
+    play(selector, contexts[:100], rewards[:100])
+    before = selector.state_dict()["means"]
+    selector.add_policy("c")
+    assert selector.state_dict()["means"][:2, 0] == pytest.approx(before[:, 0], abs=0.1)
+    rewards[:, 2] = 1.0
+    assert (play(selector, contexts[100:], rewards[100:])[-100:] == 2).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+@pytest.mark.parametrize("scale", [0.0, 1e-20, 1e-3, 1e6])
+def test_constant_and_tiny_and_huge_contexts(name, scale):
+    generator = np.random.default_rng(0)
+    contexts = (7.0 * (scale != 1e6) + scale * generator.normal(size=(60, 6))).astype(np.float32)
+    rewards = np.tile([0.0, 1.0, 0.0], (60, 1))
+    chosen = play(make_selector(name, POLICIES, 6, seed=0), contexts, rewards)
+    assert (chosen[-20:] == 1).mean() > 0.7
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+@pytest.mark.parametrize("rewards", [np.zeros((40, 3)), np.full((40, 3), -1e4), 1e6 * np.random.default_rng(0).normal(size=(40, 3))])
+def test_rewards_of_no_variance_or_another_scale(name, rewards):
+    contexts = np.random.default_rng(1).normal(size=(40, 6)).astype(np.float32)
+    selector = make_selector(name, POLICIES, 6, seed=0)
+    play(selector, contexts, rewards)
+    assert np.isfinite(list(selector.select(contexts[0]).propensities.values())).all()
+    assert all(np.isfinite(value).all() for value in selector.state_dict().values() if isinstance(value, np.ndarray) and value.dtype.kind == "f")
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+def test_one_policy_and_one_dimension(name):
+    contexts = np.random.default_rng(0).normal(size=(30, 1)).astype(np.float32)
+    selector = make_selector(name, ("only",), 1, seed=0)
+    assert (play(selector, contexts, np.ones((30, 1))) == 0).all()
+    assert selector.select(contexts[0]).propensities == {"only": 1.0}
+
+
+@pytest.mark.parametrize("name", CONTEXTUAL)
+def test_updates_may_lag_behind(name):
+    contexts, rewards, _ = clusters(6, 60)
+    selector = make_selector(name, POLICIES, 40, seed=0)
+    for start in range(0, 60, 4):
+        choices = [selector.select(context) for context in contexts[start : start + 4]]
+        for row, choice in enumerate(choices, start):
+            selector.update(contexts[row], choice, rewards[row, POLICIES.index(choice.policy)])
+    assert len(selector.state_dict()["chosen"]) == 60
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("auto", {"components": 0}),
+        ("auto", {"width": 0.0}),
+        ("auto", {"optimism": -1.0}),
+        ("auto", {"chance": float("nan")}),
+        ("auto", {"signals": ()}),
+        ("linucb", {"signals": (0.0,)}),
+        ("lints", {"components": 0}),
+        ("neural_linear", {"hidden": 0}),
+        ("auto", {"expected_costs": {"a": 0.0, "b": float("inf"), "c": 0.0}}),
+    ],
+)
+def test_wrong_settings(name, settings):
+    with pytest.raises(UsageError):
+        make_selector(name, POLICIES, 4, 0, **settings)
+
+
+def test_the_alias_is_the_same_selector():
+    assert type(make_selector("auto", POLICIES, 4, 0)) is type(make_selector("kernel_ucb", POLICIES, 4, 0)) is KernelUCBSelector
+
+
+def test_probability_of_being_the_highest():
+    generator = np.random.default_rng(0)
+    means, deviations = np.array([0.1, 0.3, 0.25, -2.0]), np.array([0.3, 0.1, 0.2, 0.3])
+    draws = means + deviations * generator.normal(size=(200_000, 4))
+    frequencies = np.bincount(draws.argmax(axis=1), minlength=4) / len(draws)
+    assert highest(means, deviations) == pytest.approx(frequencies, abs=0.005)
+    assert highest(np.array([1.0, 1.0, 0.0]), np.zeros(3)).tolist() == [0.5, 0.5, 0.0]
+
+
+def test_features_keep_what_matters():
+    generator = np.random.default_rng(0)
+    contexts = generator.normal(size=(400, 10)) * np.array([5.0, 2.0, 1.0] + [1e-9] * 7)
+    whitened = Components(8, 1.0)
+    whitened.fit(contexts)
+    assert whitened.dim == 3
+    assert np.cov(whitened.transform(contexts).T) == pytest.approx(np.eye(3) / 3, abs=0.01)
+    centres = 3.0 * generator.normal(size=(5, 10))
+    tight = centres[generator.integers(5, size=200)] + 1e-3 * generator.normal(size=(200, 10))
+    landmarks = Landmarks(8, 0.0, 0.5, 64)
+    landmarks.fit(tight)
+    assert landmarks.dim == 5  # one for each cluster
+    lengths = (landmarks.transform(tight) ** 2).sum(axis=1)
+    assert lengths == pytest.approx(np.ones(200), abs=0.03)
+    sketch = Sketch(1024)
+    long = generator.normal(size=(2, 1024)).astype(np.float32)
+    assert np.linalg.norm(sketch(long[0]) - sketch(long[1])) == pytest.approx(np.linalg.norm(long[0] - long[1]), rel=0.2)
+
+
+def spec(name: str, execute: int = 8, remote=None, **price):
+    return PolicySpec(name, name, "lerobot", "", ("agentview",), 96, execute, 0.02, remote, Price(**price), Path(f"{name}.toml"))
+
+
+def test_costs_declared_by_policy_files():
+    weights = RewardWeights(0.2, 0.01)
+    specs = [
+        spec("local"),
+        spec("paid", per_action=0.1, per_call=1.0),
+        spec("far", remote=Remote("satellite")),
+        spec("near", remote=Remote("ethernet")),
+        spec("meanwhile", execute=40, remote=Remote("satellite", "async")),
+    ]
+    costs = expected_costs(specs, weights, actions=80)
+    assert costs["local"] == pytest.approx(0.2 * np.log10(4.0))
+    assert costs["paid"] - costs["local"] == pytest.approx(0.01 * (80 * 0.1 + 10 * 1.0))
+    assert costs["far"] > costs["near"] > costs["local"]
+    assert costs["meanwhile"] == pytest.approx(costs["local"], abs=0.01)
+    in_steps = expected_costs(specs, RewardWeights(0.05, 0.0, "steps"), actions=80)
+    assert in_steps["local"] == pytest.approx(4.0)
+    with pytest.raises(UsageError, match="actions"):
+        expected_costs(specs, weights, actions=0)

@@ -1,0 +1,72 @@
+"""The checkpoints in assets/ as a user gets them."""
+
+import dataclasses
+import json
+
+import pytest
+from safetensors import safe_open
+
+from osel_sim import content
+from osel_sim.episode import Driver, run_episode
+from osel_sim.policy.call import LocalCaller
+from osel_sim.policy.registry import make_policy
+from osel_sim.sim.env import TaskEnv
+from osel_sim.sim.instance import make_instance
+
+POLICIES = ("local_small", "remote_large")
+INSTANCES = 12
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = TaskEnv("pick_place")
+    yield env
+    env.close()
+
+
+@pytest.mark.parametrize(("name", "at_least"), [("local_small", 3), ("remote_large", 8)])
+def test_solves_unseen_instances(env, name, at_least):
+    spec = dataclasses.replace(content.load_policy(name), remote=None)
+    driver = Driver(spec, LocalCaller(make_policy(spec), spec))
+    outcomes = []
+    for seed in range(INSTANCES):
+        instance = make_instance(env.task, seed)
+        env.load(instance)
+        outcomes.append(run_episode(env, instance, driver))
+    assert all(outcome.error is None for outcome in outcomes)
+    assert sum(outcome.success for outcome in outcomes) >= at_least
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_loads_through_lerobots_own_from_pretrained(name):
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.policies.factory import get_policy_class
+
+    from osel_sim.policy import register
+
+    register()
+    folder = content.resolve_checkpoint(content.load_policy(name).checkpoint)
+    policy = get_policy_class(PreTrainedConfig.from_pretrained(folder).type).from_pretrained(folder)
+    assert not any("annotation" in key for key in policy.config.input_features)  # nothing privileged
+
+
+def test_local_small_is_small():
+    folder = content.resolve_checkpoint(content.load_policy("local_small").checkpoint)
+    with safe_open(f"{folder}/model.safetensors", "np") as file:
+        sizes = [file.get_slice(key).get_shape() for key in file.keys()]  # noqa: SIM118 (not a dictionary)
+    parameters = 0
+    for shape in sizes:
+        product = 1
+        for side in shape:
+            product *= side
+        parameters += product
+    assert parameters <= 5_000_000
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_says_how_it_was_made(name):
+    folder = content.resolve_checkpoint(content.load_policy(name).checkpoint)
+    report = json.loads((folder / "training.json").read_text())
+    assert report["command"].startswith(f"python -m osel_sim.train --policy {name}")
+    datasets = report.get("datasets") or [report["dataset"]]
+    assert all(dataset["trained_on"] > 0 for dataset in datasets) and report["steps"] == report["steps_planned"]

@@ -1,0 +1,189 @@
+import os
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+from osel_sim.sim.env import TaskEnv
+from osel_sim.sim.expert import Expert
+from osel_sim.sim.instance import make_instance
+
+CAMERAS = ("agentview", "wrist")
+
+
+@pytest.fixture(scope="module")
+def env():
+    env = TaskEnv("pick_place")
+    yield env
+    env.close()
+
+
+def play(env, instance, steps=1000, look=False):
+    """The expert's run on an instance -> states after each step."""
+    env.load(instance)
+    expert = Expert(env.world)
+    states = []
+    while not env.done and len(states) < steps:
+        if look:
+            env.observe(CAMERAS, 64)
+        env.advance(expert.act())
+        states.append(env.world.data.qpos.copy())
+    return np.array(states)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_passes_the_checkers_of_gymnasium_and_sb3():
+    made = gymnasium.make("osel_sim.envs:osel_sim/pick_place-v0", cameras=CAMERAS, image_size=48)
+    gymnasium_check_env(made.unwrapped, skip_render_check=True)
+    sb3_check_env(made.unwrapped)
+    made.close()
+
+
+def test_registration_imports_nothing_heavy():
+    code = """import gymnasium, osel_sim.envs, sys
+assert "osel_sim/pick_place-v0" in gymnasium.registry
+print({"mujoco", "torch", "robosuite"} & set(sys.modules))"""
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"
+
+
+def test_same_instance_same_bits_with_or_without_images(env):
+    instance = make_instance(env.task, 11)
+    first = play(env, instance)
+    play(env, make_instance(env.task, 12))
+    np.testing.assert_array_equal(play(env, instance, look=True), first)
+
+
+def test_images_are_the_same_each_time_and_differ_between_scenes(env):
+    def images(seed):
+        env.load(make_instance(env.task, seed))
+        return env.observe(CAMERAS, 64)
+
+    first, other, again = images(1), images(2), images(1)
+    for camera in CAMERAS:
+        key = f"observation.images.{camera}"
+        np.testing.assert_array_equal(first[key], again[key])
+        assert (first[key] != other[key]).any()
+        assert first[key].shape == (64, 64, 3) and first[key].dtype == np.uint8
+    assert first["observation.state"].shape == (8,) and np.isfinite(first["observation.state"]).all()
+    assert first["task"] == make_instance(env.task, 1).instruction
+
+
+def test_a_snapshot_goes_on_to_the_same_bits_also_in_another_environment(env):
+    instance = make_instance(env.task, 5)
+    env.load(instance)
+    actions = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 7)).astype(np.float32)
+    for action in actions[:20]:
+        env.advance(action)
+    snapshot = env.snapshot()
+    for action in actions[20:]:
+        env.advance(action)
+    expected = env.world.data.qpos.copy()
+    twin = TaskEnv(env.task)
+    play(twin, make_instance(env.task, 9), steps=15)
+    for there in (env, twin):
+        there.restore(snapshot)
+        assert there.steps == 20
+        for action in actions[20:]:
+            there.advance(action)
+        np.testing.assert_array_equal(there.world.data.qpos, expected)
+    twin.close()
+
+
+def test_the_expert_solves_unseen_instances_with_subgoals_in_order(env):
+    solved = 0
+    for seed in range(1000, 1010):
+        env.load(make_instance(env.task, seed))
+        assert env.subgoal_fraction == 0.0 and not env.success
+        expert, fractions = Expert(env.world), []
+        while not env.done:
+            env.advance(expert.act())
+            fractions.append(env.subgoal_fraction)
+        assert fractions == sorted(fractions)
+        solved += env.success
+        if env.success:
+            assert fractions[-1] == 1.0
+    assert solved >= 9
+
+
+@pytest.mark.slow
+def test_the_expert_solves_97_of_100_test_instances(env):
+    solved = sum(bool(len(play(env, make_instance(env.task, seed))) and env.success) for seed in range(200))
+    assert solved >= 194
+
+
+def test_a_wrong_goal_is_no_success(env):
+    """The expert fulfils another instruction about the same scene."""
+    instance = make_instance(env.task, 1001)
+    env.load(instance)
+    other = "bowl" if instance.container != "bowl" else "plate"
+    expert = Expert(env.world)
+    env.world.instance = type(instance)(**{**instance.__dict__, "roles": {**instance.roles, "container": other}})
+    while env.steps < 150 and not env.success:
+        env.advance(expert.act())
+    assert env.success  # of the other goal
+    env.world.instance = instance
+    assert not env.success
+
+
+def test_holding_still_changes_nothing_but_time(env):
+    env.load(make_instance(env.task, 3))
+    before = env.world.grip_position.copy()
+    for _ in range(40):
+        env.advance(env.hold_action())
+    assert np.abs(env.world.grip_position - before).max() < 0.01
+    assert not env.success and env.steps == 40
+
+
+def test_cameras_see_what_is_named(env):
+    for seed in range(20):
+        instance = make_instance(env.task, seed)
+        env.load(instance)
+        positions = env.entity_positions()
+        pixels = env.project(np.array([positions[instance.target], positions[instance.container]]), "agentview", 96)
+        assert ((pixels > 0) & (pixels < 96)).all(), instance.key
+
+
+def test_projection_agrees_with_rendering(env):
+    """A red cube's projected place is red in the image."""
+    seed = next(seed for seed in range(500) if make_instance(env.task, seed).target == "red_cube")
+    env.load(make_instance(env.task, seed))
+    x, y = env.project(env.world.position("red_cube")[None], "agentview", 200)[0].astype(int)
+    red, green, blue = env.image("agentview", 200, 200)[y, x].astype(int)
+    assert red > 2 * green and red > 2 * blue
+
+
+def test_fast_and_full_images_show_the_same_scene(env):
+    env.load(make_instance(env.task, 4))
+    fast, full = (env.image("agentview", 128, 128, quality).astype(float) for quality in ("fast", "full"))
+    assert np.abs(fast - full).mean() < 12  # of 255: shadows and edges differ, nothing else
+    assert (fast != full).any()
+
+
+def test_memory_does_not_grow_over_resets(env):
+    import psutil
+
+    def cycle(count):
+        for seed in range(count):
+            env.load(make_instance(env.task, seed))
+            env.image("agentview", 64, 64)
+        return psutil.Process().memory_info().rss / 2**20
+
+    cycle(50)
+    before = cycle(50)
+    assert cycle(500) - before < 8  # MiB
+
+
+@pytest.mark.parametrize("backend", ["egl", "osmesa"])
+def test_renders_with_either_backend_even_when_mujoco_was_imported_first(backend):
+    code = "import mujoco\nfrom osel_sim.sim.env import TaskEnv\nprint(TaskEnv('pick_place').image('agentview', 32, 32).std() > 10)"
+    environment = {**os.environ, "MUJOCO_GL": backend}
+    environment.pop("OSEL_SIM_GL_CHECKED", None)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    if "apt-get install" in done.stderr:
+        pytest.skip(f"{backend} is not installed")
+    assert done.stdout.strip() == "True", done.stderr
+    assert done.stderr == ""
