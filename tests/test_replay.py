@@ -3,10 +3,10 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -170,13 +170,18 @@ def test_damage_is_noticed(log, tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_leaves_nothing_behind(log, tmp_path):
-    command = [sys.executable, "-m", "osel_sim.replay", str(log), "--selectors", "ppo", "--out", str(tmp_path / "out")]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
-    time.sleep(20)
-    os.kill(process.pid, signal.SIGINT)  # the parent alone: it has to end its workers
-    _, complaints = process.communicate(timeout=60)
+    out = tmp_path / "out"
+    # More seeds than any machine replays before the interruption, which comes once the workers are at it.
+    command = [sys.executable, "-m", "osel_sim.replay", str(log), "--selectors", "ppo", "--seeds", "5000", "--out", str(out)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True) as process:
+        shown = b""
+        while not re.search(rb"\| [1-9]", shown):  # the progress bar has moved on from 0
+            shown += (got := process.stderr.read1())
+            assert got, shown.decode()
+        os.kill(process.pid, signal.SIGINT)  # the parent alone: it has to end its workers
+        complaints = (shown + process.stderr.read()).decode()
     assert process.returncode == 130 and complaints.strip().endswith("interrupted") and "Traceback" not in complaints
-    assert not (tmp_path / "out").exists()
+    assert not out.exists()
 
 
 def _rows(folder: Path):
