@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from osel_sim import cli, content
+from osel_sim.children import end_with_parent
 from osel_sim.errors import UsageError
 from osel_sim.formats.levels import parse_axes, resolve
 from osel_sim.formats.task_file import TaskSpec
@@ -91,7 +92,7 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     failed: list[int] = []
     context = multiprocessing.get_context("spawn")  # a forked GL or numba state is a crash waiting to happen
     with (
-        ProcessPoolExecutor(workers, mp_context=context, initializer=_one_thread) as pool,
+        ProcessPoolExecutor(workers, mp_context=context, initializer=_prepare) as pool,
         tqdm(total=episodes, unit="episode", desc=task.name) as bar,
     ):
         futures = {pool.submit(record_shard, shard): shard for shard in shards}
@@ -110,8 +111,9 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     print(f"{out}: {episodes - len(failed)} demonstrations, {frames} frames; the expert failed on {len(failed)} of {episodes} seeds")
 
 
-def _one_thread() -> None:
+def _prepare() -> None:
     """Workers share the cores: one thread each, for numpy, torch and Mesa's rasteriser. The progress bar is ours."""
+    end_with_parent()
     os.environ.update(OMP_NUM_THREADS="1", LP_NUM_THREADS="1", HF_DATASETS_DISABLE_PROGRESS_BARS="1")
     _quiet_lerobot()
 

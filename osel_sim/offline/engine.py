@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.children import end_with_parent
 from osel_sim.errors import OselError
 from osel_sim.formats.replay_result import Choices
 from osel_sim.offline.log import LoggedOutcomes
@@ -126,6 +127,7 @@ _material: _Material | None = None
 def _prepare(material: _Material) -> None:
     """Make a worker ready."""
     global _material
+    end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C: end without a word, the parent says what there is to say
     _limit_threads()
     _material = material
