@@ -12,6 +12,7 @@ from osel_sim.errors import UsageError
 EXAMPLES = """examples:
   python -m osel_sim.train --policy local_small --data data/pick_place --out runs/train/local_small
   python -m osel_sim.train --policy local_small --data data/pick_place --out runs/train/local_small --resume
+  python -m osel_sim.train --policy remote_large --data data/mine --init assets/policies/remote_large --steps 2000     (adapt it to more data)
   python -m osel_sim.train --encoder osel_small --data data/scenes     (the context encoder instead; --encoder --help tells more)
 """
 
@@ -44,6 +45,7 @@ def parser() -> cli.Parser:
     result.add_argument("--episodes", type=int, help="train on the first N episodes of each dataset only (default: the recipe's)")
     result.add_argument("--seed", type=int, default=0, help="fixes first weights, order and augmentation (default: %(default)s)")
     result.add_argument("--threads", type=int, default=0, help="processor threads (default: all cores)")
+    result.add_argument("--init", metavar="DIR", type=Path, help="begin with the weights of this checkpoint folder, of the same model")
     result.add_argument("--resume", action="store_true", help="continue in --out exactly where the last saved state was")
     result.add_argument(
         "--eval-every", metavar="STEPS", type=int, default=1000, help="validate and write the checkpoint so often (default: %(default)s)"
@@ -113,6 +115,7 @@ def _train_policy(options: argparse.Namespace) -> int:
             save_every=options.save_every,
             half=options.half,
             tasks=options.tasks,
+            init=options.init,
         ),
     )
     print(f"{out}: {result['steps']} steps in {result['training_seconds'] / 60:.1f} minutes")

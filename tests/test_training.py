@@ -18,7 +18,7 @@ from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file
 
 from osel_sim import content
-from osel_sim.errors import ContentError, DataError, UnknownNameError, UsageError
+from osel_sim.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
 from osel_sim.policy.language_chunk import LanguageChunkPolicy
 from osel_sim.train import main
 from osel_sim.training.batches import Batches, frames_of, statistics_of
@@ -200,6 +200,23 @@ def test_half_precision_is_half_the_size_and_loads(tmp_path: Path, demonstration
     assert {value.dtype for value in saved.values()} == {torch.float16}
     policy = LanguageChunkPolicy.from_pretrained(tmp_path)
     assert {value.dtype for value in policy.parameters()} == {torch.float32}
+
+
+def test_training_begins_with_a_checkpoint(tmp_path: Path, demonstrations: Path) -> None:
+    run(tmp_path / "first", demonstrations, 3)
+    spec = replace(content.load_policy("local_small"), image_size=48)
+    still = recipe(steps=1, learning_rate=0.0)
+    options = Options(out=tmp_path / "second", threads=1, seed=5, init=tmp_path / "first")
+    result = train(spec, replace(still, episodes=3), [demonstrations], options)  # another seed, other statistics
+    assert result["init"]["name"] == "first"
+    for name in ("model.safetensors", next((tmp_path / "first").glob("policy_preprocessor_*.safetensors")).name):
+        before, after = (load_file(tmp_path / folder / name) for folder in ("first", "second"))
+        assert before and all(torch.equal(before[key], after[key]) for key in before)
+    wider = replace(still, model=MODEL | {"hidden": 128})
+    with pytest.raises(CheckpointError, match=r"head\.\S+ is .* there, .* here"):
+        train(spec, wider, [demonstrations], replace(options, out=tmp_path / "third"))
+    with pytest.raises(CheckpointError, match="no checkpoint"):
+        train(spec, still, [demonstrations], replace(options, out=tmp_path / "third", init=demonstrations))
 
 
 def test_data_without_annotations_trains_actions_only(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.training.batches import Batches, frames_of, statistics_of
 from osel_sim.training.dataset import Demonstrations, dataset_folders, load_demonstrations, task_of
 from osel_sim.training.evaluation import validate
+from osel_sim.training.initial import Initial
 from osel_sim.training.loop import Trainer
 from osel_sim.training.memory import keep_memory
 from osel_sim.training.models import make_model
@@ -39,6 +40,7 @@ class Options:
         half: save the weights in half precision.
         until: stop after so many steps, as if interrupted there.
         tasks: folder with the user's own task files, for rollouts.
+        init: checkpoint folder whose weights, and what it normalises by, training begins with; None: fresh weights.
     """
 
     out: Path
@@ -52,6 +54,7 @@ class Options:
     half: bool = False
     until: int | None = None
     tasks: Path | None = None
+    init: Path | None = None
 
 
 def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Options) -> dict[str, Any]:
@@ -63,6 +66,7 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
     Raises:
         DataError: a dataset or an earlier state does not fit.
         UsageError: `out` is in use and `resume` was not asked for.
+        CheckpointError: `init` is no checkpoint, or one of another model.
     """
     began = time.time()
     if not options.resume and options.out.exists() and any(options.out.iterdir()):
@@ -72,11 +76,12 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
     keep_memory()
     torch.backends.cuda.enable_flash_sdp(torch.cuda.is_available())  # on a CPU its backward pass takes twice as long as plain matrix products
     device = "cuda" if torch.cuda.is_available() else "cpu"
+    initial = Initial(options.init) if options.init is not None else None
     data = load_datasets(folders, spec, recipe)
     splits = [_split(one, recipe) for one in data]
     frames = [frames_of(one, training) for one, (training, _) in zip(data, splits, strict=True)]
     held_frames = [frames_of(one, held) for one, (_, held) in zip(data, splits, strict=True)]
-    statistics = statistics_of(data, frames)
+    statistics = {**statistics_of(data, frames), **(initial.statistics if initial is not None else {})}
     torch.manual_seed(options.seed)
     model = make_model(spec, recipe, data, statistics, device)
     wanted = model.wanted(recipe.optimisation.grounding_pairs)
@@ -86,7 +91,11 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
     (prepare, _), (prepare_held, finish) = model.preparing(), model.preparing()
     size = recipe.optimisation.batch_size
     trainee, policy_of = model.trainee(prepare(batches.training(0, size)))
-    identity = json.dumps([recipe.to_dict(), [one.fingerprint for one in data], options.seed, list(spec.cameras)], sort_keys=True)
+    if initial is not None:
+        initial.fill(policy_of(trainee))
+    identity = json.dumps(
+        [recipe.to_dict(), [one.fingerprint for one in data], options.seed, list(spec.cameras), initial and initial.digest], sort_keys=True
+    )
     trainer = Trainer(
         trainee,
         lambda step: prepare(batches.training(step, size)),
@@ -114,6 +123,7 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
             "command": " ".join(["python -m osel_sim.train", *sys.argv[1:]]),
             "seed": options.seed,
             "recipe": recipe.to_dict(),
+            "init": {"name": initial.folder.name, "sha256": initial.digest} if initial is not None else None,
             "datasets": [
                 {"task": one.name, "fingerprint": one.fingerprint, "episodes": one.episodes, "trained_on": len(training), "frames": len(own)}
                 for one, (training, _), own in zip(data, splits, frames, strict=True)

@@ -1,0 +1,55 @@
+"""Training that begins with the weights of a checkpoint."""
+
+from hashlib import sha256
+from pathlib import Path
+
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import make_pre_post_processors
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.processor import NormalizerProcessorStep
+from safetensors.torch import load_file
+
+from osel_sim.errors import CheckpointError
+from osel_sim.policy import register
+from osel_sim.training.batches import Statistics
+
+WEIGHTS = "model.safetensors"
+
+
+class Initial:
+    """A LeRobot checkpoint folder to begin with.
+
+    Raises:
+        CheckpointError: it is none, or cannot be read.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        register()
+        self.folder = folder
+        try:
+            self.config = PreTrainedConfig.from_pretrained(folder)
+            self._weights = load_file(folder / WEIGHTS)
+            before, _ = make_pre_post_processors(self.config, str(folder), preprocessor_overrides={"device_processor": {"device": "cpu"}})
+        except Exception as error:  # the hub client, JSON, safetensors and draccus all have their own
+            raise CheckpointError(f"{folder}: is no checkpoint to begin with ({type(error).__name__}: {error})") from None
+        found = [step.stats for step in before.steps if isinstance(step, NormalizerProcessorStep)]
+        self.statistics: Statistics = {
+            key: {name: torch.as_tensor(value, dtype=torch.float32) for name, value in values.items()} for key, values in (found or [{}])[0].items()
+        }
+        self.digest = sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+
+    def fill(self, policy: PreTrainedPolicy) -> None:
+        """Give a policy the checkpoint's weights.
+
+        Raises:
+            CheckpointError: it has other parts, or parts of another size.
+        """
+        if policy.config.type != self.config.type:
+            raise CheckpointError(f"{self.folder}: is of type {self.config.type!r}, the recipe wants {policy.config.type!r}")
+        own = policy.state_dict()
+        for name in sorted({*own, *self._weights}):
+            sizes = [tuple(state[name].shape) if name in state else None for state in (self._weights, own)]
+            if sizes[0] != sizes[1]:
+                raise CheckpointError(f"{self.folder}: does not fit the recipe and the policy file: {name} is {sizes[0]} there, {sizes[1]} here")
+        policy.load_state_dict(self._weights)
