@@ -184,6 +184,20 @@ def test_tables_leave_errors_out_of_the_rates(capsys):
     assert "held-out" in text
 
 
+def test_tables_tell_tasks_and_levels_apart_where_there_are_several(capsys):
+    rows = [
+        replace(row(seed, task=task, level=level), instance=f"{task}/{level}/{seed}")
+        for task in ("lift", "door")
+        for level in (0, 2)
+        for seed in range(3)
+    ]
+    print_rollouts(Console(width=160), rows, preset("oxe"))
+    text = capsys.readouterr().out
+    assert "door 2" in text and "task at level" in text
+    print_rollouts(Console(width=160), rows[:3], preset("oxe"))
+    assert "level" not in capsys.readouterr().out
+
+
 def test_share_best_counts_complete_instances_only():
     rows = [row(0, "small", price=0.0), row(0, "large"), row(2, "small"), row(2, "large", price=0.0), row(4, "small", error="died"), row(4, "large")]
     assert share_best(rows, ["small", "large"], preset("oxe")) == {"small": 0.5, "large": 0.5}

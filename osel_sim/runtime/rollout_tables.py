@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import Row
 from osel_sim.runtime.tables import number, percent
 from osel_sim.selection.reward import RewardWeights, logged_reward, logged_seconds
@@ -14,6 +15,8 @@ from osel_sim.statistics import wilson_interval
 
 SPLITS: dict[str, Callable[[Row], str | None]] = {
     "task": lambda row: row.task,
+    "level": lambda row: None if row.level is None else label(row.level, row.axes),
+    "task at level": lambda row: None if row.level is None else f"{row.task} {label(row.level, row.axes)}",
     "object": lambda row: row.target,
     "container": lambda row: row.container,
     "phrasing": lambda row: None if row.phrasing is None else row.phrasing.rpartition("-")[0].replace("_", "-") or row.phrasing,
@@ -84,20 +87,24 @@ _MEASURES = {"subgoals": ("subgoals", 2), "score": ("score", 4), "steps": ("step
 
 
 def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
-    table = Table(title="success [95%] by what was asked", title_justify="left")
+    table = Table(title="success [95%] by kind of instance", title_justify="left")
     table.add_column("by")
     table.add_column("")
     table.add_column("instances", justify="right")
     for policy in policies:
         table.add_column(policy, justify="right")
+    kinds: dict[str, int] = {}
     for name, key in SPLITS.items():
         parts: dict[str, list[Row]] = defaultdict(list)
         for row in rows:
             value = key(row)
             if value is not None:
                 parts[value].append(row)
-        if name == "task" and len(parts) == 1:
-            continue  # the title says it
+        kinds[name] = len(parts)
+        if name in ("task", "level") and len(parts) == 1:
+            continue  # all the same
+        if name == "task at level" and 1 in (kinds["task"], kinds["level"]):
+            continue  # shown already
         for value, part in sorted(parts.items()):
             rates = [_rate([row for row in part if row.policy == policy and row.error is None]) for policy in policies]
             table.add_row(name, value, str(len({row.instance for row in part})), *rates)
