@@ -15,6 +15,7 @@ from osel_sim.children import end_with_parent
 from osel_sim.errors import UsageError
 from osel_sim.formats.levels import parse_axes, resolve
 from osel_sim.formats.task_file import TaskSpec
+from osel_sim.training.annotations import SIDE_FILE
 
 SHARD = 20
 EXAMPLES = """examples:
@@ -54,12 +55,21 @@ def main(arguments: list[str] | None = None) -> int:
     for task, out in zip(tasks, outs, strict=True):
         settings = {"task": task.name, "task_version": task.version, "levels": options.level, "axes": axes, "image_size": options.image_size}
         _check_settings(_shards_folder(out), settings)
+        if _seeds(out) == options.episodes:
+            print(f"{out} is complete")  # and stays as it is: training tells datasets apart by when their files were written, too
+            continue
         collect(task, out, options.episodes, tuple(options.level), axes, options.image_size, options.workers)
     return 0
 
 
 def _shards_folder(out: Path) -> Path:
     return out.with_name(out.name + ".shards")
+
+
+def _seeds(out: Path) -> int | None:
+    """How many seeds the dataset is of, or None where there is none."""
+    side = out / "meta" / SIDE_FILE
+    return json.loads(side.read_text())["seeds"] if side.is_file() else None
 
 
 def _check_settings(folder: Path, settings: dict[str, object]) -> None:
@@ -107,7 +117,7 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
             raise
     _join(task, out, [shard.folder for shard in shards])
     side = side_file(task, levels, axes, len(shards), episodes, sorted(failed))
-    (out / "meta" / "osel_sim.json").write_text(json.dumps(side, indent=1))
+    (out / "meta" / SIDE_FILE).write_text(json.dumps(side, indent=1))
     print(f"{out}: {episodes - len(failed)} demonstrations, {frames} frames; the expert failed on {len(failed)} of {episodes} seeds")
 
 

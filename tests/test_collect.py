@@ -75,6 +75,10 @@ def test_worker_count_and_interruption_change_nothing(tmp_path):
     refused = collect("--episodes", 22, "--out", tmp_path / "two", "--image-size", 64, "--resume")
     assert refused.returncode == 2 and "image_size" in refused.stderr
     assert collect("--episodes", 22, "--out", tmp_path / "two", "--workers", 2, "--image-size", 32, "--resume").returncode == 0
+    written = {file: file.stat().st_mtime_ns for file in (tmp_path / "two").rglob("*.parquet")}
+    again = collect("--episodes", 22, "--out", tmp_path / "two", "--image-size", 32, "--resume")
+    assert again.returncode == 0 and "complete" in again.stdout
+    assert {file: file.stat().st_mtime_ns for file in written} == written
     for one, two in zip(contents(tmp_path / "one"), contents(tmp_path / "two"), strict=True):
         np.testing.assert_array_equal(one, two)
     side = json.loads((tmp_path / "two" / "meta" / "osel_sim.json").read_text())
