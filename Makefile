@@ -1,4 +1,4 @@
-# make run | test | slow | lint | bench | wheel | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
+# make run | test | slow | lint | bench | policies | wheel | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
@@ -8,7 +8,10 @@ ARGS ?=
 # One thread a process: the tests run in several, and simulation gains nothing from more.
 ONE_THREAD := OMP_NUM_THREADS=1
 
-.PHONY: run test slow lint bench wheel requirements environment clean
+SHORT := open_drawer close_drawer press_button door pick_place lift stack push nut_assembly
+POLICIES := local_small remote_base remote_specialist remote_large
+
+.PHONY: run test slow lint bench policies wheel requirements environment clean
 
 run: $(READY)
 	$(PYTHON) -m osel_sim.run --task pick_place --counterfactual --video 3 --out $(OUT) $(ARGS)
@@ -26,6 +29,17 @@ lint: $(READY)
 
 bench: $(READY)
 	$(PYTHON) benchmarks/simulation.py $(ARGS)
+
+# From nothing to the checkpoints in assets/policies and what they can do: demonstrations, training, measurement. Interrupted, it goes on where it was.
+policies: $(READY)
+	$(PYTHON) -m osel_sim.collect --task $(SHORT) --episodes 240 --level 0 1 2 --out data/suite --resume
+	$(PYTHON) -m osel_sim.collect --task tidy --episodes 120 --level 0 1 2 --out data/suite/tidy --resume
+	$(PYTHON) -m osel_sim.collect --task sort --episodes 60 --level 0 1 2 --out data/suite/sort --resume
+	for policy in $(POLICIES); do \
+		$(PYTHON) -m osel_sim.train --policy $$policy --data data/suite --out runs/train/$$policy --half --resume $(ARGS) && \
+		mkdir -p assets/policies/$$policy && cp runs/train/$$policy/*.json runs/train/$$policy/*.safetensors assets/policies/$$policy/ || exit 1; \
+	done
+	$(PYTHON) -m osel_sim.record --task all --level 0 2 --instances 100 --repeats 3 --repeat-every 10 --out runs/suite $$([ ! -f runs/suite/run.json ] || echo --resume)
 
 wheel: $(READY)
 	$(PYTHON) -m build --no-isolation

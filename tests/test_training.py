@@ -40,7 +40,7 @@ def demonstrations(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recipe(**optimisation: Any) -> Recipe:
     shipped = load_recipe(find_recipe("local_small"))
     settings = {"batch_size": 16, "warmup_steps": 10, "ema_decay": 0.98, "learning_rate": 3e-3} | optimisation
-    return replace(shipped, model=MODEL, episodes=None, validation_episodes=6, optimisation=replace(shipped.optimisation, **settings))
+    return replace(shipped, model=MODEL, weights={}, episodes=None, validation_episodes=6, optimisation=replace(shipped.optimisation, **settings))
 
 
 def run(folder: Path, data: Path, steps: int, **options: Any) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from safetensors.torch import load_file
 
 from osel_sim import content
-from osel_sim.errors import ContentError, DataError
+from osel_sim.errors import ContentError, DataError, UnknownNameError
 from osel_sim.policy import register
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.training.annotations import load_annotations
@@ -49,7 +49,7 @@ def lifting(folder: Path, episodes: int = 20) -> Path:
 def recipe(kind: str, **optimisation: Any) -> Recipe:
     shipped = load_recipe(find_recipe("remote_large"))
     settings = {"batch_size": 8, "warmup_steps": 10, "ema_decay": 0.98, "learning_rate": 2e-3} | optimisation
-    changes = {"type": kind, "model": SIZES[kind], "validation_episodes": 4, "augmentation": replace(shipped.augmentation, shift=2)}
+    changes = {"type": kind, "model": SIZES[kind], "weights": {}, "validation_episodes": 4, "augmentation": replace(shipped.augmentation, shift=2)}
     return replace(shipped, **changes, optimisation=replace(shipped.optimisation, **settings))
 
 
@@ -118,12 +118,14 @@ def test_two_datasets_are_sampled_by_weight_and_reported_by_task(tmp_path: Path,
     home.mkdir()
     (home / "pick_place").symlink_to(demonstrations)
     lifting(home / "lift")
-    result = run("octo_chunk", tmp_path / "out", [home], 4, changes={"weights": {"lift": 3.0}})
+    result = run("octo_chunk", tmp_path / "out", [home], 4, changes={"weights": {"lift": 3.0, "stack": 2.0}})
     assert [dataset["task"] for dataset in result["datasets"]] == ["lift", "pick_place"]
     final = result["validation"][-1]
     assert final["tasks"].keys() == {"lift", "pick_place"} and final["action_error"] > 0
     with pytest.raises(DataError, match=r"wants demonstrations of 'stack', there are those of: lift, pick_place"):
         run("octo_chunk", tmp_path / "other", [home], 4, changes={"tasks": ("stack",)})
+    with pytest.raises(UnknownNameError, match=r"'stak': did you mean 'stack'.*data\.weights"):
+        run("octo_chunk", tmp_path / "other", [home], 4, changes={"weights": {"stak": 2.0}})
     with pytest.raises(DataError, match="is given twice"):
         run("octo_chunk", tmp_path / "other", [home, demonstrations], 4)
 
@@ -183,7 +185,12 @@ def test_places_of_a_frame_are_those_of_the_camera_as_it_is_then(demonstrations:
 
 
 def test_recipes_of_all_types_and_what_they_refuse(tmp_path: Path) -> None:
-    for name, kind in {"local_small": "language_chunk", "octo_chunk": "octo_chunk", "remote_base": "act"}.items():
+    for name, kind in {
+        "local_small": "language_chunk",
+        "remote_large": "octo_chunk",
+        "remote_base": "act",
+        "remote_specialist": "language_chunk",
+    }.items():
         assert load_recipe(find_recipe(name)).type == kind
     file = tmp_path / "bad.toml"
     for text, message in {

@@ -17,7 +17,8 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from numpy.typing import NDArray
 
-from osel_sim.errors import DataError, UsageError
+from osel_sim import content
+from osel_sim.errors import DataError, UnknownNameError, UsageError
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.training.batches import Batches, frames_of, statistics_of
 from osel_sim.training.dataset import Demonstrations, dataset_folders, load_demonstrations, task_of
@@ -168,11 +169,15 @@ def load_datasets(folders: Sequence[Path], spec: PolicySpec, recipe: Recipe) -> 
 
     Raises:
         DataError: one cannot be read, two are of one task, one that the recipe wants is missing, or only some are annotated.
+        UnknownNameError: the recipe weighs a task that there is not.
     """
     found = {task_of(folder) or folder.resolve().name: folder for folder in dataset_folders(folders)}
     if len(found) < len(dataset_folders(folders)):
         raise DataError(f"{', '.join(map(str, folders))}: two datasets are of one task; there can be one of each of {', '.join(found)}")
-    for task in [*(recipe.tasks or ()), *recipe.weights]:
+    for task in recipe.weights:  # of a task that is not trained on: no matter, but a wrong name is one
+        if task not in found and task not in content.files("tasks"):
+            raise UnknownNameError("task", task, {**found, **content.files("tasks")}, f"data.weights of {recipe.file}")
+    for task in recipe.tasks or ():
         if task not in found:
             raise DataError(f"{recipe.file}: wants demonstrations of {task!r}, there are those of: {', '.join(sorted(found))}")
     data = [load_demonstrations(folder, spec.cameras) for task, folder in found.items() if recipe.tasks is None or task in recipe.tasks]
