@@ -255,7 +255,7 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
     from osel_sim.context import train as training
     from osel_sim.context.train import Settings, train
 
-    settings = Settings(steps=4, scenes=24, test_scenes=12, views=8, texts=8)
+    settings = Settings(tasks=("pick_place", "sort"), steps=4, scenes=24, test_scenes=12, views=8, texts=8)
     whole = train(settings, tmp_path, tmp_path / "whole")
     batches: list[recipe.Batch] = []
     make_batch = recipe.make_batch
@@ -275,6 +275,9 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
         train(replace(settings, seed=1), tmp_path, tmp_path / "cut", resume=True)
     train(settings, tmp_path, tmp_path / "cut", resume=True)
     assert (tmp_path / "whole" / "open_clip_model.safetensors").read_bytes() == (tmp_path / "cut" / "open_clip_model.safetensors").read_bytes()
+    measured = whole["measured"]
+    assert measured["task"]["neighbours"]["chance"] == 0.5
+    assert "image_to_instruction" in measured["tasks"]["pick_place"] and "image_to_instruction" not in measured["tasks"]["sort"]  # names no object
     assert whole["settings"]["steps"] == 4 and not (tmp_path / "cut" / "training_state.pt").exists()
     assert load_encoder(str(tmp_path / "whole")).dimension == 256
     with pytest.raises(UsageError, match="holds a checkpoint already"):

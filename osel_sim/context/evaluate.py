@@ -1,5 +1,7 @@
 """How much an encoder understands of unseen scenes: retrieval both ways, neighbours of contexts, and what linear probes read from them."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,12 +11,31 @@ from osel_sim.context.captions import NAMINGS, PLACES, Captions
 from osel_sim.context.encoder import OpenClipEncoder
 from osel_sim.context.scenes import Scenes
 from osel_sim.formats.task_file import TaskSpec
+from osel_sim.formats.terms import KINDS
 
 Embeddings = NDArray[np.float32]
 
 CANDIDATES = 6
-"""Retrieval picks the right one of that many: chance is 1/6."""
+"""Retrieval picks the right one of that many, where there are as many: chance is 1/6."""
 NEIGHBOURS = 10
+PROBED = 50
+"""Linear probes need so many contexts."""
+
+
+def measure_all(encoder: OpenClipEncoder, tasks: Sequence[TaskSpec], scenes: Sequence[Scenes]) -> dict[str, Any]:
+    """`measure` of one task; of several: that of each under `tasks`, and over all scenes together `task`, how well contexts tell the tasks apart."""
+    if len(tasks) == 1:
+        return measure(encoder, tasks[0], scenes[0])
+    contexts = np.concatenate([_contexts(encoder, one) for one in scenes])
+    labels = np.repeat([task.name for task in tasks], [len(one) for one in scenes])
+    result: dict[str, Any] = {"neighbours": {"agree": neighbour_agreement(contexts, labels), "chance": chance(labels)}}
+    if len(contexts) >= PROBED:
+        result["probe"] = _probe(contexts, labels)
+    return {"task": _rounded(result), "tasks": {task.name: measure(encoder, task, one) for task, one in zip(tasks, scenes, strict=True)}}
+
+
+def _contexts(encoder: OpenClipEncoder, scenes: Scenes) -> Embeddings:
+    return np.stack([encoder.encode([image], text) for image, text in zip(scenes.images, scenes.instructions.tolist(), strict=True)])
 
 
 def measure(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, seed: int = 0) -> dict[str, Any]:
@@ -26,33 +47,42 @@ def measure(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, seed: int 
     - `place`: whether the named object is on the left, in the middle or on the right (chance 1/3);
     - `neighbours`: how many of a context's 10 nearest agree with it in object, container, phrasing; `chance` beside each;
     - `probes`: accuracy of a linear classifier on the context, 5-fold; `place_r2`: of ridge regression from the picture to where things are.
+
+    What makes no sense for a task is left out: retrieval where all things are always there, names where there is one thing of a kind.
     """
     rng = np.random.default_rng(seed)
     images = np.stack([encoder.embed_image(image) for image in scenes.images])
     texts = np.stack([encoder.embed_text(text) for text in scenes.instructions.tolist()])
     held_out = np.char.startswith(scenes.phrasings, "held_out")
-    to_text, to_image = _retrieve(encoder, task, scenes, images, texts, rng)
     contexts = np.concatenate([images, texts], axis=1)
-    labels = context_labels(task, scenes)
-    result: dict[str, Any] = {
-        "scenes": len(scenes),
-        "image_to_instruction": _split(to_text, held_out),
-        "instruction_to_image": _split(to_image, held_out),
-        "cutout_to_name": {kind: _name_cutouts(encoder, task, scenes, kind) for kind in ("object", "container")},
-        "place": _places(encoder, task, scenes, images),
+    labels = {name: values for name, values in context_labels(task, scenes).items() if len(np.unique(values)) > 1}
+    result: dict[str, Any] = {"scenes": len(scenes)}
+    if _always_named(task) and np.isnan(scenes.pixels[..., 0]).any():
+        to_text, to_image = _retrieve(encoder, task, scenes, images, texts, rng)
+        result |= {"image_to_instruction": _split(to_text, held_out), "instruction_to_image": _split(to_image, held_out)}
+    kinds = [kind for kind in KINDS if len(task.of_kind(kind)) > 1]
+    result |= {
+        "cutout_to_name": {kind: _name_cutouts(encoder, task, scenes, kind) for kind in kinds},
         "neighbours": {name: {"agree": neighbour_agreement(contexts, values), "chance": chance(values)} for name, values in labels.items()},
     }
-    if len(scenes) >= 50:
+    if (place := _places(encoder, task, scenes, images)) is not None:
+        result["place"] = place
+    if len(scenes) >= PROBED:
         result["probes"] = {name: _probe(contexts, values) for name, values in labels.items()}
         result["place_r2"] = _place_r2(images, scenes)
     rounded: dict[str, Any] = _rounded(result)
     return rounded
 
 
+def _always_named(task: TaskSpec) -> bool:
+    """Whether instructions name an object first, as retrieval has it."""
+    return next(iter(task.roles.values())) == "object"
+
+
 def context_labels(task: TaskSpec, scenes: Scenes) -> dict[str, NDArray[Any]]:
     """What a context may cluster by, each (N,)."""
     objects = [entity.kind == "object" for entity in task.entities]
-    there = ~np.isnan(scenes.pixels[:, objects, 0])
+    there = ~np.isnan(scenes.pixels[:, objects, 0])  # (N, objects); no column in a task without objects
     return {"object": scenes.targets, "container": scenes.containers, "phrasing": scenes.phrasings, "objects_there": there.sum(axis=1)}
 
 
@@ -66,23 +96,39 @@ def neighbour_agreement(contexts: Embeddings, labels: NDArray[Any], neighbours: 
     return float(np.mean([np.mean(labels[row[row != me][:count]] == labels[me]) for row, me in zip(nearest, own[:, 0], strict=True)]))
 
 
+@dataclass
+class _Trials:
+    """Choices of one among several: (N,) whether each was right, and how likely a guess was to be."""
+
+    right: NDArray[np.bool_]
+    chance: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, count: int) -> "_Trials":
+        return cls(np.zeros(count, bool), np.ones(count))
+
+    def add(self, index: int, right: float, wrong: NDArray[np.float32]) -> None:
+        """Note a trial: similarity of the right one, and of the wrong ones. Where there are none there is no choice, and the trial does not count."""
+        self.right[index], self.chance[index] = right > wrong.max(initial=-np.inf), 1 / (1 + len(wrong))
+
+
 def _retrieve(
     encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, images: Embeddings, texts: Embeddings, rng: np.random.Generator
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+) -> tuple[_Trials, _Trials]:
     """Whether each picture finds its instruction, and each instruction its picture."""
     order = {entity.name: index for index, entity in enumerate(task.entities)}
     objects = [entity for entity in task.entities if entity.kind == "object"]
     there = ~np.isnan(scenes.pixels[..., 0])
-    to_text, to_image = np.zeros(len(scenes), bool), np.zeros(len(scenes), bool)
+    to_text, to_image = _Trials.of(len(scenes)), _Trials.of(len(scenes))
     for index, (target, instruction) in enumerate(zip(scenes.targets.tolist(), scenes.instructions.tolist(), strict=True)):
         named = next(name for name in sorted(task.entity(target).names, key=len, reverse=True) if name in instruction)
         absent = [entity for entity in objects if not there[index, order[entity.name]]]
         others = [absent[choice] for choice in rng.permutation(len(absent))[: CANDIDATES - 1]]
         wrong = [encoder.embed_text(instruction.replace(named, entity.names[rng.integers(len(entity.names))])) for entity in others]
-        to_text[index] = images[index] @ texts[index] > max(images[index] @ text for text in wrong)
+        to_text.add(index, images[index] @ texts[index], np.array([images[index] @ text for text in wrong], np.float32))
         without = np.flatnonzero(~there[:, order[target]])
         chosen = rng.permutation(without)[: CANDIDATES - 1]
-        to_image[index] = images[index] @ texts[index] > np.max(images[chosen] @ texts[index], initial=-np.inf)
+        to_image.add(index, images[index] @ texts[index], images[chosen] @ texts[index])
     return to_text, to_image
 
 
@@ -101,19 +147,21 @@ def _name_cutouts(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, kind
     return float(np.mean(right))
 
 
-def _places(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, images: Embeddings) -> float:
-    """Of scenes in which it can be told: whether the target's place among left, middle and right is found."""
+def _places(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, images: Embeddings) -> float | None:
+    """Of scenes in which it can be told: whether the target's place among left, middle and right is found. None: it never can."""
     order = [entity.name for entity in task.entities]
     words = ("on the left", "in the middle", "on the right")
     facts = Captions(task).facts(scenes.pixels)
     texts = {name: np.stack([encoder.embed_text(f"the {task.entity(name).names[0]} is {place}") for place in words]) for name in order}
     right = []
     for index, target in enumerate(scenes.targets.tolist()):
+        if target not in order:
+            continue  # a property
         first = len(order) + order.index(target) * len(PLACES)
         told = [facts[index, first + list(PLACES).index(place)] for place in words]
         if 1 in told and 0 not in told:
             right.append(int(np.argmax(texts[target] @ images[index])) == told.index(1))
-    return float(np.mean(right)) if right else float("nan")
+    return float(np.mean(right)) if right else None
 
 
 def _probe(contexts: Embeddings, labels: NDArray[Any]) -> float:
@@ -147,9 +195,10 @@ def chance(labels: NDArray[Any]) -> float:
     return float(np.sum((counts / len(labels)) ** 2))
 
 
-def _split(right: NDArray[np.bool_], held_out: NDArray[np.bool_]) -> dict[str, float | int]:
-    groups = {"trained_phrasings": right[~held_out], "held_out_phrasings": right[held_out]}
-    return {name: float(group.mean()) for name, group in groups.items() if len(group)} | {"chance": 1 / CANDIDATES}
+def _split(trials: _Trials, held_out: NDArray[np.bool_]) -> dict[str, float]:
+    counted = trials.chance < 1
+    groups = {"trained_phrasings": trials.right[counted & ~held_out], "held_out_phrasings": trials.right[counted & held_out]}
+    return {name: float(group.mean()) for name, group in groups.items() if len(group)} | {"chance": float(trials.chance[counted].mean())}
 
 
 def _rounded(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 import gzip
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -33,15 +33,17 @@ PREPROCESS = {"mean": [MEAN] * 3, "std": [STD] * 3, "interpolation": "bicubic", 
 
 @dataclass(frozen=True)
 class Batch:
-    """Views, captions and what is true of them.
+    """Views of one task's scenes, captions and what is true of them.
 
     Attributes:
+        task: name of the task.
         images: float32 (B, 3, S, S), normalised.
         texts: M captions.
         truth: int8 (B, M), 1 true, -1 false, 0 cannot be told.
         pixels: float32 (B, E, 2), where each entity is, as fractions of the view; NaN where it is not in it.
     """
 
+    task: str
     images: Any
     texts: list[str]
     truth: NDArray[np.int8]
@@ -90,7 +92,7 @@ def make_batch(scenes: Scenes, captions: Captions, views: int, texts: int, rng: 
     grid = functional.affine_grid(theta, [views, 3, IMAGE_SIZE, IMAGE_SIZE], align_corners=False)
     images = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
     pixels[facts[:, : pixels.shape[1]] != 1] = np.nan
-    return Batch(images, [caption.text for caption in drawn], truth(facts, drawn), pixels)
+    return Batch(captions.task.name, images, [caption.text for caption in drawn], truth(facts, drawn), pixels)
 
 
 class Objective:
@@ -98,16 +100,20 @@ class Objective:
 
     Pairs teach quickly what is there, and slowly where; a readout of where things are speeds that up. Captions that claim the same should embed
     alike, but a selector may want to know how something was said; a readout of the words used keeps that in the text embedding.
+
+    Args:
+        entities: task -> how many things can be in its scenes.
     """
 
     where_weight, wording_weight = 1.0, 0.05
 
-    def __init__(self, model: Any, entities: int) -> None:
+    def __init__(self, model: Any, entities: Mapping[str, int]) -> None:
         import torch
 
         self.model = model
         width = model.text_projection.shape[1]
-        self.readouts = torch.nn.ModuleDict({"where": torch.nn.Linear(width, 2 * entities), "wording": torch.nn.Linear(width, model.vocab_size)})
+        where = {f"where_{task}": torch.nn.Linear(width, 2 * count) for task, count in entities.items()}
+        self.readouts = torch.nn.ModuleDict({**where, "wording": torch.nn.Linear(width, model.vocab_size)})
         self.readouts.to(model.logit_scale.device)
 
     def __call__(self, batch: Batch, tokens: Any) -> Any:
@@ -119,7 +125,7 @@ class Objective:
         images = model.encode_image(batch.images.to(device, memory_format=torch.channels_last), normalize=True).float()
         texts = model.encode_text(tokens, normalize=True).float()
         pairwise = self._pairwise(images, texts, torch.from_numpy(batch.truth).float().to(device))
-        where = self._where(images, torch.from_numpy(batch.pixels).to(device))
+        where = self._where(batch.task, images, torch.from_numpy(batch.pixels).to(device))
         return pairwise + self.where_weight * where + self.wording_weight * self._wording(texts, tokens)
 
     def _pairwise(self, images: Any, texts: Any, truths: Any) -> Any:
@@ -129,10 +135,10 @@ class Objective:
         losses = -functional.logsigmoid(truths * (self.model.logit_scale.exp() * images @ texts.T + self.model.logit_bias))
         return sum(0.5 * (losses * (truths == sign)).sum() / (truths == sign).sum().clamp(min=1) for sign in (1, -1))
 
-    def _where(self, images: Any, pixels: Any) -> Any:
+    def _where(self, task: str, images: Any, pixels: Any) -> Any:
         """Mean absolute error of the places of what is in view, as fractions of the view."""
         there = ~pixels.isnan()
-        errors = (self.readouts["where"](10 * images).view_as(pixels) - pixels.nan_to_num()).abs()
+        errors = (self.readouts[f"where_{task}"](10 * images).view_as(pixels) - pixels.nan_to_num()).abs()
         return (errors * there).sum() / there.sum().clamp(min=1)
 
     def _wording(self, texts: Any, tokens: Any) -> Any:

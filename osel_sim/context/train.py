@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim import cli
-from osel_sim.content import find
+from osel_sim.content import select_tasks
 from osel_sim.context.encoder import DEFAULT_ENCODER, WEIGHTS
 from osel_sim.errors import CheckpointError, UnknownNameError, UsageError
 
@@ -18,7 +18,7 @@ REPORT = "training.json"
 SAVE_SECONDS = 60.0
 EXAMPLES = """examples:
   python -m osel_sim.train --encoder osel_small --data data/scenes
-  python -m osel_sim.train --encoder osel_small --data data/scenes --minutes 30 --out runs/train/osel_small
+  python -m osel_sim.train --encoder osel_small --data data/scenes --task all --steps 3000 --out runs/train/osel_small
 """
 
 
@@ -27,13 +27,14 @@ class Settings:
     """How to train.
 
     Attributes:
+        tasks: whose scenes are seen; with several, steps take turns.
         steps: gradient steps; the learning rate falls to zero over them.
-        scenes, test_scenes: how many instances of the train and the test split are rendered.
+        scenes, test_scenes: how many instances of each task's train and test split are rendered.
         views, texts: views and captions a batch.
         rate: peak learning rate of AdamW.
     """
 
-    task: str = "pick_place"
+    tasks: tuple[str, ...] = ("pick_place",)
     steps: int = 1600
     seed: int = 0
     scenes: int = 8_000
@@ -52,12 +53,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="rendered scenes are kept here, and rendered if missing")
     parser.add_argument("--out", type=Path, metavar="DIR", help="the checkpoint's folder (default: DATA/<encoder>); load it with --encoder DIR")
-    parser.add_argument("--task", default=defaults.task)
+    parser.add_argument("--task", nargs="+", default=list(defaults.tasks), help="names, tag:TAG, or all (default: pick_place)")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=int, default=defaults.steps, help="gradient steps (default: %(default)s)")
     length.add_argument("--minutes", type=float, help="as many steps as fit, timed on the first ones")
-    parser.add_argument("--scenes", type=int, default=defaults.scenes, help="training scenes (default: %(default)s)")
-    parser.add_argument("--test-scenes", type=int, default=defaults.test_scenes, help="test scenes to measure on (default: %(default)s)")
+    parser.add_argument("--scenes", type=int, default=defaults.scenes, help="training scenes of each task (default: %(default)s)")
+    parser.add_argument("--test-scenes", type=int, default=defaults.test_scenes, help="test scenes of each task to measure on (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=defaults.seed)
     parser.add_argument("--device", default="", help="torch device (default: cuda if there, else cpu)")
     parser.add_argument("--resume", action="store_true", help="go on from the last saved state in the checkpoint's folder, to --steps")
@@ -69,8 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise UsageError(f"--{name.replace('_', '-')} must be 1 or more, got {getattr(options, name)}")
     if options.minutes is not None and not options.minutes > 0:
         raise UsageError(f"--minutes must be more than 0, got {options.minutes}")
-    find("tasks", options.task)
-    settings = Settings(options.task, options.steps, options.seed, options.scenes, options.test_scenes)
+    tasks = tuple(task.name for task in select_tasks(options.task))
+    settings = Settings(tasks, options.steps, options.seed, options.scenes, options.test_scenes)
     report = train(settings, options.data, options.out or options.data / options.encoder, options.minutes, options.device, options.resume)
     print(json.dumps(report["measured"], indent=2))
     return 0
@@ -91,24 +92,23 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
     from osel_sim.context import recipe
     from osel_sim.context.captions import Captions
     from osel_sim.context.encoder import VOCABULARY, OpenClipEncoder
-    from osel_sim.context.evaluate import measure
+    from osel_sim.context.evaluate import measure_all
     from osel_sim.context.scenes import cached_scenes
-    from osel_sim.formats.task_file import load_task_file
 
     if not resume and (out / WEIGHTS).exists():
         raise UsageError(f"{out} holds a checkpoint already; pass --resume to go on with it, or another --out")
-    task = load_task_file(find("tasks", settings.task))
-    scenes = cached_scenes(data, task, settings.scenes, "train", recipe.IMAGE_SIZE)
-    test = cached_scenes(data, task, settings.test_scenes, "test", recipe.IMAGE_SIZE)
+    tasks = select_tasks(settings.tasks)
+    scenes = [cached_scenes(data, task, settings.scenes, "train", recipe.IMAGE_SIZE) for task in tasks]
+    test = [cached_scenes(data, task, settings.test_scenes, "test", recipe.IMAGE_SIZE) for task in tasks]
     recipe.write_architecture(out)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     torch.manual_seed(settings.seed)
     # channels_last makes bfloat16 convolutions on a CPU half again as fast
     model = open_clip.CLIP(**recipe.MODEL).to(device, memory_format=torch.channels_last)
     tokenizer = open_clip.get_tokenizer(f"local-dir:{out}", bpe_path=str(out / VOCABULARY))
-    objective = recipe.Objective(model, len(task.entities))
+    objective = recipe.Objective(model, {task.name: len(task.entities) for task in tasks})
     optimizer = torch.optim.AdamW([*model.parameters(), *objective.readouts.parameters()], lr=settings.rate, betas=(0.9, 0.98), weight_decay=0.05)
-    captions, words = Captions(task), recipe.filler_words(tokenizer)
+    captions, words = [Captions(task) for task in tasks], recipe.filler_words(tokenizer)
     step, steps, seconds, saved, smooth = 0, settings.steps, 0.0, time.monotonic(), 0.0
     if resume and (out / STATE).exists():
         step, planned, seconds = _load_state(out / STATE, settings, objective, optimizer)
@@ -123,7 +123,8 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
             for group in optimizer.param_groups:
                 group["lr"] = settings.rate * min((step + 1) / 100, 0.5 * (1 + math.cos(math.pi * step / steps)))
             # Each step has its own generator, so that a resumed training sees what an uninterrupted one would have seen.
-            batch = recipe.make_batch(scenes, captions, settings.views, settings.texts, np.random.default_rng([settings.seed, step]), words)
+            turn, chance = step % len(tasks), np.random.default_rng([settings.seed, step])
+            batch = recipe.make_batch(scenes[turn], captions[turn], settings.views, settings.texts, chance, words)
             with torch.autocast(device.partition(":")[0], torch.bfloat16):
                 loss = objective(batch, tokenizer(batch.texts))
             optimizer.zero_grad()
@@ -150,7 +151,7 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
         "threads": torch.get_num_threads(),
         "torch": torch.__version__,
         "open_clip": open_clip.__version__,
-        "measured": measure(OpenClipEncoder.from_folder(out, DEFAULT_ENCODER), task, test),
+        "measured": measure_all(OpenClipEncoder.from_folder(out, DEFAULT_ENCODER), tasks, test),
     }
     (out / REPORT).write_text(json.dumps(report, indent=2) + "\n")
     (out / STATE).unlink(missing_ok=True)
@@ -183,9 +184,9 @@ def _load_state(file: Path, settings: Settings, objective: Any, optimizer: Any) 
     import torch
 
     state = torch.load(file, map_location="cpu", weights_only=True)
-    differing = [key for key, value in vars(settings).items() if state["settings"][key] != value and key not in ("steps", "test_scenes")]
+    differing = [key for key, value in vars(settings).items() if state["settings"].get(key) != value and key not in ("steps", "test_scenes")]
     if differing:
-        was = ", ".join(f"{key} {state['settings'][key]!r}" for key in differing)
+        was = ", ".join(f"{key} {state['settings'].get(key)!r}" for key in differing)
         raise CheckpointError(f"{file} was trained with {was}; resume with the same")
     objective.model.load_state_dict(state["model"])
     objective.readouts.load_state_dict(state["readouts"])
