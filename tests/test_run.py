@@ -98,7 +98,7 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
             command(world, "run", *arguments, *flags), env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         )
         wait_for_lines(process, folder / "episodes.jsonl", 1 + attempt + chance.randrange(3 - trial))
-        time.sleep(chance.random() * 0.5)
+        time.sleep(chance.random() * 0.15)  # about a decision: somewhere in the next one
         process.send_signal(signal.SIGKILL)
         process.wait()
         process.stderr.close()
