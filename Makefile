@@ -9,12 +9,12 @@ ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1
 
 SHORT := open_drawer close_drawer press_button door pick_place lift stack push nut_assembly
-POLICIES := local_small remote_base remote_specialist remote_large
+POLICIES := local_small remote_specialist remote_large
 
 .PHONY: run test slow lint bench policies wheel requirements environment clean
 
 run: $(READY)
-	$(PYTHON) -m osel_sim.run --task pick_place --counterfactual --video 3 --out $(OUT) $(ARGS)
+	$(PYTHON) -m osel_sim.run --task pick_place --policies local_small remote_large --counterfactual --video 3 --out $(OUT) $(ARGS)
 
 test: $(READY)
 	$(ONE_THREAD) $(PYTHON) -m pytest -m "not slow" -n $(WORKERS) $(ARGS)

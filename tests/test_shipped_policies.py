@@ -13,19 +13,15 @@ from osel_sim.policy.registry import make_policy
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.instance import make_instance
 
-POLICIES = ("local_small", "remote_large")
+POLICIES = ("local_small", "remote_large", "remote_specialist")
 INSTANCES = 12
 
 
-@pytest.fixture(scope="module")
-def env():
-    env = TaskEnv("pick_place")
-    yield env
-    env.close()
-
-
-@pytest.mark.parametrize(("name", "at_least"), [("local_small", 3), ("remote_large", 8)])
-def test_solves_unseen_instances(env, name, at_least):
+@pytest.mark.parametrize(
+    ("name", "task", "at_least"), [("local_small", "pick_place", 3), ("remote_large", "pick_place", 8), ("remote_specialist", "open_drawer", 8)]
+)
+def test_solves_unseen_instances(name, task, at_least):
+    env = TaskEnv(task)
     spec = dataclasses.replace(content.load_policy(name), remote=None)
     driver = Driver(spec, LocalCaller(make_policy(spec), spec))
     outcomes = []
@@ -33,6 +29,7 @@ def test_solves_unseen_instances(env, name, at_least):
         instance = make_instance(env.task, seed)
         env.load(instance)
         outcomes.append(run_episode(env, instance, driver))
+    env.close()
     assert all(outcome.error is None for outcome in outcomes)
     assert sum(outcome.success for outcome in outcomes) >= at_least
 
@@ -68,5 +65,4 @@ def test_says_how_it_was_made(name):
     folder = content.resolve_checkpoint(content.load_policy(name).checkpoint)
     report = json.loads((folder / "training.json").read_text())
     assert report["command"].startswith(f"python -m osel_sim.train --policy {name}")
-    datasets = report.get("datasets") or [report["dataset"]]
-    assert all(dataset["trained_on"] > 0 for dataset in datasets) and report["steps"] == report["steps_planned"]
+    assert all(dataset["trained_on"] > 0 for dataset in report["datasets"]) and report["steps"] == report["steps_planned"]
