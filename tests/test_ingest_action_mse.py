@@ -87,7 +87,7 @@ def test_shipped_policies_are_measured(dataset, tmp_path):
     assert [row.success for row in rows] == [row.score >= -0.3 for row in rows]
     local, remote = rows[:2]
     assert (local.task, local.upload, local.inference, local.price, local.calls, local.actions) == ("flat_world", 0.0, 0.015, 0.0, 1, 8)
-    assert remote.upload > 0 and remote.download > 0 and remote.price == pytest.approx(1.0 + 0.1 * 8)
+    assert remote.upload > 0 and remote.download > 0 and remote.price == pytest.approx(content.load_policy("remote_large").price.of(8, 1, 0.0))
     assert (local.steps, local.subgoals, local.motion) == (None, None, None)
     assert metadata["source"] == {"metric": "action-mse", "datasets": ["flat_world"], "frames": 2, "tolerance": 0.3}
     assert len(ContextCache(out).table(metadata["encoder"], [row.instance for row in rows])) == len(rows)
