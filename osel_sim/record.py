@@ -42,7 +42,7 @@ def parser() -> cli.Parser:
     add("--task", nargs="+", default=[], metavar="NAME", help="which tasks: names, tag:TAG, or all")
     add("--instances", type=cli.positive_int, default=200, metavar="N", help="number of instances of each task (default: %(default)s)")
     add("--repeats", type=cli.positive_int, default=1, metavar="R", help="episodes of each policy on an instance (default: %(default)s)")
-    add("--repeat-every", type=cli.positive_int, default=1, metavar="K", help="repeat on every K-th instance only (default: on all)")
+    add("--repeat-every", type=cli.positive_int, default=1, metavar="K", help="repeat on one in K instances of each level only (default: on all)")
     add("--workers", type=cli.positive_int, default=2, metavar="W", help="processes (default: %(default)s)")
     add("--policies", nargs="+", metavar="NAME", help="policies to run (default: all there are)")
     add("--level", type=cli.non_negative_int, nargs="+", default=[0], help="how hard scenes are perturbed, 0 to 3; several take turns (default: 0)")

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -145,3 +146,15 @@ def serving_with(handler: Callable[[ServerConnection], None], greeting: bytes | 
         finally:
             server.shutdown()
             thread.join(10)
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that nobody has buried is dead."""
+    status = Path(f"/proc/{pid}/stat")
+    if status.parent.parent.is_dir() and not status.exists():
+        return False
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return status.read_text().rsplit(")", 1)[1].split()[0] != "Z" if status.exists() else True

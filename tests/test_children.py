@@ -1,11 +1,12 @@
 """Workers of a pool whose parent is killed."""
 
-import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+
+from remote_helpers import alive
 
 SCRIPT = """
 import multiprocessing, os, time
@@ -30,12 +31,3 @@ def test_killed_parents_leave_no_workers(tmp_path: Path) -> None:
     while any(map(alive, workers)) and time.monotonic() < end:
         time.sleep(0.05)
     assert not any(map(alive, workers))
-
-
-def alive(pid: int) -> bool:
-    """Whether the process runs; one that nobody has buried is dead."""
-    try:
-        os.kill(pid, 0)
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (ProcessLookupError, FileNotFoundError):
-        return False

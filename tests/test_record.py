@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
 
-from osel_sim import record
+from osel_sim import content, record
 from osel_sim.context.cache import ContextCache
 from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.formats.task_file import load_task_file
+from osel_sim.runtime.workers import Plan
 
 INSTANCES, REPEATS = 5, 2
 SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)
@@ -35,6 +37,13 @@ def reference(world):
 
 def files(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in ("rollouts.parquet", "contexts.npz")}
+
+
+def test_repeats_are_of_all_levels():
+    task, policy = load_task_file(content.find("tasks", "lift")), content.load_policy("local_small")
+    plan = Plan((task,), (policy,), (policy,), range(40), (0, 2), "test", "osel_small", repeats=3, repeat_every=10)
+    repeated = [plan.instances[key] for key in plan.instances if len(plan.episodes(key)) == 3]
+    assert sorted(instance.level for instance in repeated) == [0, 0, 2, 2]
 
 
 def test_every_policy_on_every_instance_from_the_same_state(reference):

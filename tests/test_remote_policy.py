@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from remote_helpers import GREETING, TOKEN, Sinusoid, install_plugin, observation, policy_spec, serving, serving_with
+from remote_helpers import GREETING, TOKEN, Sinusoid, alive, install_plugin, observation, policy_spec, serving, serving_with
 
 from osel_sim.errors import RemoteError, UsageError
 from osel_sim.policy.call import Call, LocalCaller
@@ -247,17 +247,6 @@ def test_the_server_dies_with_its_parent_however_that_dies(plugin):
         time.sleep(0.1)
     os.kill(pid, signal.SIGKILL)
     pytest.fail("the server outlived its parent")
-
-
-def alive(pid):
-    status = Path(f"/proc/{pid}/stat")
-    if status.parent.parent.is_dir() and not status.exists():
-        return False
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return status.read_text().rsplit(")", 1)[1].split()[0] != "Z" if status.exists() else True
 
 
 def test_a_server_of_somebody_else(tmp_path, url, monkeypatch):

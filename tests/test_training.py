@@ -215,8 +215,9 @@ def test_training_begins_with_a_checkpoint(tmp_path: Path, demonstrations: Path)
     wider = replace(still, model=MODEL | {"hidden": 128})
     with pytest.raises(CheckpointError, match=r"head\.\S+ is .* there, .* here"):
         train(spec, wider, [demonstrations], replace(options, out=tmp_path / "third"))
-    with pytest.raises(CheckpointError, match="no checkpoint"):
-        train(spec, still, [demonstrations], replace(options, out=tmp_path / "third", init=demonstrations))
+    for nothing in (demonstrations, Path("somebody/nothing")):
+        with pytest.raises(CheckpointError, match=r"no checkpoint to begin with: it has no model\.safetensors"):
+            train(spec, still, [demonstrations], replace(options, out=tmp_path / "third", init=nothing))
 
 
 def test_data_without_annotations_trains_actions_only(tmp_path: Path) -> None:

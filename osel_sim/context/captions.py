@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.formats.task_file import ATTRIBUTE, TaskSpec
+from osel_sim.formats.terms import KINDS
 
 EDGE = 0.04
 """A thing whose middle is nearer than this to the edge of a view (fraction of its side) is neither surely in it nor surely out."""
@@ -50,9 +51,8 @@ class Captions:
 
     def __init__(self, task: TaskSpec) -> None:
         self.task = task
-        self._of_kind: dict[str, list[int]] = {}
-        for index, entity in enumerate(task.entities):
-            self._of_kind.setdefault(entity.kind, []).append(index)
+        self._of_kind = {kind: [index for index, entity in enumerate(task.entities) if entity.kind == kind] for kind in KINDS}
+        self._properties = [role for role, kind in task.roles.items() if kind == ATTRIBUTE]
         self._fixtures = [index for index, entity in enumerate(task.entities) if entity.kind != "object"]
         self.count = len(task.entities) * (1 + len(PLACES)) + len(NUMBERS)
 
@@ -62,7 +62,7 @@ class Captions:
         present = np.where(outside < -EDGE, 1, np.where(outside > EDGE, -1, 0)).astype(np.int8)
         places = np.stack([self._within(pixels[..., axis], low, high) for axis, low, high in PLACES.values()], axis=2)
         places = np.where(present[..., None] == 1, places, present[..., None])  # what is not there is nowhere
-        seen = present[:, self._of_kind.get("object", [])]
+        seen = present[:, self._of_kind["object"]]
         numbers = np.arange(1, len(NUMBERS) + 1)[None]
         exact = np.where((seen == 1).sum(axis=1, keepdims=True) == numbers, 1, -1)
         counts = np.where((seen == 0).any(axis=1, keepdims=True), 0, exact)
@@ -79,10 +79,6 @@ class Captions:
         properties = {role: _pick(self.task.attributes[_pick(list(self.task.attributes), rng)], rng) for role in self._properties}
         return Caption(template.format(**names, **properties), tuple(roles.values()))
 
-    @property
-    def _properties(self) -> list[str]:
-        return [role for role, kind in self.task.roles.items() if kind == ATTRIBUTE]
-
     def draw(self, facts: NDArray[np.int8], count: int, rng: np.random.Generator, words: Sequence[str]) -> list[Caption]:
         """Captions for a batch of views with `facts` (N, F); about half the things they speak of are taken from what is in some view.
 
@@ -96,11 +92,10 @@ class Captions:
         if kind < 0.4:
             roles: dict[str, int] = {}
             for role, wanted in self.task.roles.items():
-                if wanted == ATTRIBUTE:
-                    continue
-                roles[role] = self._entity([index for index in self._of_kind[wanted] if index not in roles.values()], seen, rng)
+                if role not in self._properties:
+                    roles[role] = self._entity([index for index in self._of_kind[wanted] if index not in roles.values()], seen, rng)
             return self.instruction(roles, _vary(_pick(self.task.train, rng), rng, words), rng)
-        objects = self._of_kind.get("object", [])
+        objects = self._of_kind["object"]
         loose = bool(objects) and (rng.random() < 0.7 or not self._fixtures)
         entity = self._entity(objects if loose else self._fixtures, seen, rng)
         if kind < 0.5:

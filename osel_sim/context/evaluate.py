@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.context.captions import NAMINGS, PLACES, Captions
-from osel_sim.context.encoder import OpenClipEncoder
+from osel_sim.context.encoder import OpenClipEncoder, encode_many
 from osel_sim.context.scenes import Scenes
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.formats.terms import KINDS
@@ -26,16 +26,13 @@ def measure_all(encoder: OpenClipEncoder, tasks: Sequence[TaskSpec], scenes: Seq
     """`measure` of one task; of several: that of each under `tasks`, and over all scenes together `task`, how well contexts tell the tasks apart."""
     if len(tasks) == 1:
         return measure(encoder, tasks[0], scenes[0])
-    contexts = np.concatenate([_contexts(encoder, one) for one in scenes])
+    pictured = [([image], text) for one in scenes for image, text in zip(one.images, one.instructions.tolist(), strict=True)]
+    contexts = encode_many(encoder, pictured)
     labels = np.repeat([task.name for task in tasks], [len(one) for one in scenes])
     result: dict[str, Any] = {"neighbours": {"agree": neighbour_agreement(contexts, labels), "chance": chance(labels)}}
     if len(contexts) >= PROBED:
         result["probe"] = _probe(contexts, labels)
     return {"task": _rounded(result), "tasks": {task.name: measure(encoder, task, one) for task, one in zip(tasks, scenes, strict=True)}}
-
-
-def _contexts(encoder: OpenClipEncoder, scenes: Scenes) -> Embeddings:
-    return np.stack([encoder.encode([image], text) for image, text in zip(scenes.images, scenes.instructions.tolist(), strict=True)])
 
 
 def measure(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, seed: int = 0) -> dict[str, Any]:
@@ -57,7 +54,8 @@ def measure(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, seed: int 
     contexts = np.concatenate([images, texts], axis=1)
     labels = {name: values for name, values in context_labels(task, scenes).items() if len(np.unique(values)) > 1}
     result: dict[str, Any] = {"scenes": len(scenes)}
-    if _always_named(task) and np.isnan(scenes.pixels[..., 0]).any():
+    names_object = next(iter(task.roles.values())) == "object"
+    if names_object and np.isnan(scenes.pixels[..., 0]).any():
         to_text, to_image = _retrieve(encoder, task, scenes, images, texts, rng)
         result |= {"image_to_instruction": _split(to_text, held_out), "instruction_to_image": _split(to_image, held_out)}
     kinds = [kind for kind in KINDS if len(task.of_kind(kind)) > 1]
@@ -72,11 +70,6 @@ def measure(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, seed: int 
         result["place_r2"] = _place_r2(images, scenes)
     rounded: dict[str, Any] = _rounded(result)
     return rounded
-
-
-def _always_named(task: TaskSpec) -> bool:
-    """Whether instructions name an object first, as retrieval has it."""
-    return next(iter(task.roles.values())) == "object"
 
 
 def context_labels(task: TaskSpec, scenes: Scenes) -> dict[str, NDArray[Any]]:

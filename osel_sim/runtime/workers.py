@@ -36,7 +36,7 @@ class Plan:
         everyone: those and their fallbacks.
         seeds: of the instances of each task.
         levels: taken in turn, seed by seed.
-        repeats: episodes of each policy on every `repeat_every`th seed's instance; on the others one.
+        repeats: episodes of each policy on one in `repeat_every` instances of each level; on the others one.
         encoder: as `load_encoder` takes it.
         axes: axis -> level, where it differs from the instance's level.
     """
@@ -60,7 +60,8 @@ class Plan:
 
     def episodes(self, instance: str) -> list[tuple[str, int]]:
         """(policy, repeat) of the instance of this key, in the order of rows."""
-        repeats = self.repeats if self.instances[instance].seed % self.repeat_every == 0 else 1
+        turn = self.instances[instance].seed // len(self.levels)  # of all levels once: counting seeds would repeat some levels and never others
+        repeats = self.repeats if turn % self.repeat_every == 0 else 1
         return [(spec.name, repeat) for spec in self.policies for repeat in range(repeats)]
 
 

@@ -27,12 +27,14 @@ class Initial:
     def __init__(self, folder: Path) -> None:
         register()
         self.folder = folder
+        if not (folder / WEIGHTS).is_file():  # LeRobot would take it for a hub name
+            raise CheckpointError(f"{folder}: is no checkpoint to begin with: it has no {WEIGHTS}")
         try:
             self.config = PreTrainedConfig.from_pretrained(folder)
             self._weights = load_file(folder / WEIGHTS)
             before, _ = make_pre_post_processors(self.config, str(folder), preprocessor_overrides={"device_processor": {"device": "cpu"}})
         except Exception as error:  # the hub client, JSON, safetensors and draccus all have their own
-            raise CheckpointError(f"{folder}: is no checkpoint to begin with ({type(error).__name__}: {error})") from None
+            raise CheckpointError(f"{folder}: is no checkpoint to begin with ({type(error).__name__}: {' '.join(str(error).split())})") from None
         found = [step.stats for step in before.steps if isinstance(step, NormalizerProcessorStep)]
         self.statistics: Statistics = {
             key: {name: torch.as_tensor(value, dtype=torch.float32) for name, value in values.items()} for key, values in (found or [{}])[0].items()
