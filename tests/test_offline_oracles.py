@@ -37,6 +37,18 @@ def test_luck_is_not_foresight():
     assert expected_oracle(coins[:, :, :1]) is None
 
 
+def test_repeats_on_a_tenth_stand_for_all():
+    generator = np.random.default_rng(4)
+    rates = generator.choice([0.1, 0.9], (6000, 2))
+    rewards = (generator.random((6000, 2, 4)) < rates[:, :, None]).astype(float)
+    full = expected_oracle(rewards)
+    rewards[np.arange(6000) % 10 > 0, :, 1:] = np.nan
+    few = expected_oracle(rewards)
+    best = np.nanmean(rewards, axis=2).mean(axis=0).max()
+    assert full.mean() - best > 0.15
+    assert few.mean() == pytest.approx(full.mean(), abs=0.04)
+
+
 def test_groups_that_tell_nothing_are_not_used(tmp_path: Path):
     generator = np.random.default_rng(1)
     rows = [

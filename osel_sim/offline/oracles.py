@@ -28,7 +28,7 @@ class Oracles:
 
     Attributes:
         best_single, worst_single: columns of the policies with the highest and the lowest mean reward over all instances.
-        expected: (N,) reward of the policy that was best on the same instance in other repeats; None without repeats.
+        expected: (N,) reward of the policy that was best on the same instance in other repeats, an estimate where it has none; None without repeats.
         predictable: (N,) reward of the policy that was best on *other* instances of the same group (by task, target, container, phrasing).
         grouping: the attributes it went by, for each half of the instances it was scored on.
         per_task: column of the policy with the highest mean reward on each instance's task, (N,).
@@ -62,7 +62,8 @@ def expected_oracle(rewards: Array) -> Array | None:
     """Best policy by its mean over one half of an instance's repeats, scored by its mean over the other half; mean of both ways round, (N,).
 
     Chosen and scored on the same outcomes, luck would count as foresight. An instance on which some policy has a single repeat only cannot be split:
-    it gets the reward of the policy that is best overall. None if no instance can be split.
+    it gets the reward of the policy that is best overall and, on top, the mean gain over that policy of those that can be. So the mean is that of
+    the repeated instances, which have to be a fair sample of all. None if no instance can be split.
 
     Args:
         rewards: (N, P, R), NaN where there is no outcome.
@@ -74,11 +75,13 @@ def expected_oracle(rewards: Array) -> Array | None:
     if not splits.any():
         return None
     means = mean_over_repeats(rewards)
-    value = means[:, int(means.mean(axis=0).argmax())].copy()
+    best = means[:, int(means.mean(axis=0).argmax())]
     rows = np.flatnonzero(splits)
     one = second[rows, first[rows].argmax(axis=1)]
     other = first[rows, second[rows].argmax(axis=1)]
-    value[rows] = (one + other) / 2.0
+    gain = (one + other) / 2.0 - best[rows]
+    value = best + gain.mean()
+    value[rows] = best[rows] + gain
     return value
 
 
