@@ -75,7 +75,7 @@ class Subscriber:
 
 
 def episode_seed(instance_key: str, policy: str, repeat: int) -> tuple[int, ...]:
-    """What fixes an episode's chance (network delays): the instance, the policy and the repeat, never the order of episodes."""
+    """What fixes an episode's chance (network delays, noise on actions): the instance, the policy and the repeat, never the order of episodes."""
     return (*(int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") for text in (instance_key, policy)), repeat)
 
 
@@ -92,6 +92,7 @@ def run_episode(
     fallback: Driver | None = None,
     subscribers: Sequence[Subscriber] = (),
     repeat: int = 0,
+    action_noise: float = 0.0,
 ) -> Outcome:
     """Let `driver` act until the task is done or the horizon is reached.
 
@@ -101,11 +102,13 @@ def run_episode(
     Args:
         env: holds `instance`, just loaded or restored.
         repeat: number of this episode among those of the same policy on the same instance.
+        action_noise: standard deviation of Gaussian noise on the six motions of every action a policy makes, in units of action, >= 0. Without it an
+            episode differs from its repeat in the network's delays at most, and a local policy's not at all.
 
     Returns:
         the outcome. `calls` and `actions` are the driver's own; `price` and `seconds` contain the fallback's.
     """
-    episode = _Episode(env, instance, subscribers)
+    episode = _Episode(env, instance, subscribers, _Noise(action_noise, (*episode_seed(instance.key, driver.spec.name, repeat), 1)))
     fallback_reason: str | None = None
     error: str | None = None
     try:
@@ -138,11 +141,25 @@ class _Tally:
         return self.spec.price.of(self.actions, self.calls, self.megabytes)
 
 
+class _Noise:
+    """What the arm makes of an action: the robot's own inaccuracy, which no policy sees coming. The gripper only opens and closes."""
+
+    def __init__(self, deviation: float, seed: tuple[int, ...]) -> None:
+        self._deviation, self._random = deviation, np.random.default_rng(seed)
+
+    def __call__(self, action: Actions) -> Actions:
+        if self._deviation == 0.0:
+            return action
+        action = action.copy()
+        action[:-1] += self._deviation * self._random.standard_normal(ACTION_DIM - 1)
+        return np.clip(action, -1.0, 1.0)
+
+
 class _Episode:
     """The running state of one episode."""
 
-    def __init__(self, env: "TaskEnv", instance: "Instance", subscribers: Sequence[Subscriber]) -> None:
-        self.env, self.instance, self.subscribers = env, instance, subscribers
+    def __init__(self, env: "TaskEnv", instance: "Instance", subscribers: Sequence[Subscriber], noise: _Noise) -> None:
+        self.env, self.instance, self.subscribers, self.noise = env, instance, subscribers, noise
         self.policy = ""
         self.tallies: list[_Tally] = []  # the driver's, then the fallback's
         self.upload = self.inference = self.download = 0.0
@@ -211,7 +228,7 @@ class _Episode:
 
     def _step(self, action: "Actions | None") -> None:
         """One control step with an action of the policy, or holding still."""
-        self.env.advance(self.env.hold_action() if action is None else action)
+        self.env.advance(self.env.hold_action() if action is None else self.noise(action))
         if action is not None:
             self.tallies[-1].actions += 1
         frame = self._frame(waiting=action is None)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli, content
 from osel_sim.errors import DataError, OselError, UsageError
-from osel_sim.run import DEFAULT_PRESET, SPLITS
+from osel_sim.run import DEFAULT_PRESET, NOISE_HELP, SPLITS
 
 if TYPE_CHECKING:
     from osel_sim.formats.shards import Shards
@@ -47,6 +47,7 @@ def parser() -> cli.Parser:
     add("--policies", nargs="+", metavar="NAME", help="policies to run (default: all there are)")
     add("--level", type=cli.non_negative_int, nargs="+", default=[0], help="how hard scenes are perturbed, 0 to 3; several take turns (default: 0)")
     add("--axis", action="append", default=[], metavar="AXIS=LEVEL", help="one axis at a level of its own, such as camera=2; repeatable")
+    add("--action-noise", type=cli.non_negative_float, default=0.0, metavar="S", help=NOISE_HELP)
     add("--split", choices=SPLITS, default="test", help="which instances (default: %(default)s)")
     add("--start-seed", type=cli.non_negative_int, default=0, metavar="S", help="seed of the first instance (default: %(default)s)")
     add("--encoder", metavar="NAME", help="osel_small (default), MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
@@ -86,6 +87,7 @@ def _record(options: argparse.Namespace) -> int:
         repeats=options.repeats,
         repeat_every=options.repeat_every,
         axes=parse_axes(options.axis),
+        action_noise=options.action_noise,
     )
     axes = sorted({instance.axes for instance in plan.instances.values() if instance.axes})  # refuses an unknown level or axis before anything loads
     configuration: dict[str, Any] = {
@@ -97,6 +99,7 @@ def _record(options: argparse.Namespace) -> int:
         "repeat_every": options.repeat_every,
         "levels": options.level,
         "axes": axes,
+        "action_noise": options.action_noise,
         "split": options.split,
         "content": content_digests(tasks, everyone),
     }

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 DEFAULT_PRESET = "oxe"
 SPLITS = ("train", "validation", "test")
+NOISE_HELP = "standard deviation of noise on the motions of every action, in units of action; 1 is 5 cm or half a radian (default: %(default)s)"
 
 EXAMPLES = """examples:
   python -m osel_sim.run --list                                            # tasks and policies there are
@@ -60,6 +61,7 @@ def parser() -> cli.Parser:
         "--level", type=cli.non_negative_int, nargs="+", default=[0], help="how hard scenes are perturbed, 0 to 3; several mix at random (default: 0)"
     )
     add("--axis", action="append", default=[], metavar="AXIS=LEVEL", help="one axis at a level of its own, such as camera=2; repeatable")
+    add("--action-noise", type=cli.non_negative_float, default=0.0, metavar="S", help=NOISE_HELP)
     add("--split", choices=SPLITS, default="test", help="which instances (default: %(default)s)")
     add("--encoder", metavar="NAME", help="osel_small (default), MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
     add("--preset", metavar="NAME", help=f"reward weights of the paper: mmlu, waymo, alfred, oxe (default: {DEFAULT_PRESET})")
@@ -128,7 +130,7 @@ def _run(options: argparse.Namespace) -> int:
         for warning in start_or_resume(folder, configuration, ran_with, options.resume):
             print(f"warning: {warning}", file=sys.stderr)
         live_options = LiveOptions(
-            options.seed, tuple(options.level), options.split, options.counterfactual, _filmed(options), options.realtime, axes
+            options.seed, tuple(options.level), options.split, options.counterfactual, _filmed(options), options.realtime, axes, options.action_noise
         )
         live = LiveRun(folder, tasks, envs, encoder, ContextCache(folder), drivers, selector, weights, live_options)
         stack.callback(live.close)
@@ -286,6 +288,7 @@ def _configuration(
         "seed": options.seed,
         "levels": options.level,
         "axes": above,
+        "action_noise": options.action_noise,
         "split": options.split,
         "reward": asdict(weights),
         "counterfactual": options.counterfactual,

@@ -43,6 +43,7 @@ class LiveOptions:
         realtime: sleep so that control steps happen at 20 Hz.
         levels: of which each instance has one, at random.
         axes: axis -> level, where it differs from the instance's level.
+        action_noise: as `run_episode` takes it.
     """
 
     seed: int
@@ -52,6 +53,7 @@ class LiveOptions:
     video: frozenset[int] = frozenset()
     realtime: bool = False
     axes: Mapping[str, int] = field(default_factory=dict)
+    action_noise: float = 0.0
 
 
 class LiveRun:
@@ -127,7 +129,7 @@ class LiveRun:
             env.restore(snapshot)
             timings[policy] = Timing()
             listeners = [timings[policy], *self._listeners(index, policy)] if chosen else [timings[policy]]
-            return run_episode(env, instance, self.drivers[policy], self.drivers.fallback(policy), listeners)
+            return run_episode(env, instance, self.drivers[policy], self.drivers.fallback(policy), listeners, action_noise=self.options.action_noise)
 
         outcome = run(choice.policy, chosen=True)
         decision = self._decision(index, instance, choice, outcome)

@@ -39,6 +39,7 @@ class Plan:
         repeats: episodes of each policy on one in `repeat_every` instances of each level; on the others one.
         encoder: as `load_encoder` takes it.
         axes: axis -> level, where it differs from the instance's level.
+        action_noise: as `run_episode` takes it.
     """
 
     tasks: tuple[TaskSpec, ...]
@@ -51,6 +52,7 @@ class Plan:
     repeats: int = 1
     repeat_every: int = 1
     axes: Mapping[str, int] = field(default_factory=dict)
+    action_noise: float = 0.0
 
     @functools.cached_property
     def instances(self) -> dict[str, Instance]:
@@ -207,7 +209,7 @@ def _work(plan: Plan, pipe: Connection) -> None:
             pipe.send(encoder.encode(view(env, encoder), instance.instruction))
             for policy, repeat in episodes:
                 env.restore(start)
-                outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat)
+                outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat, action_noise=plan.action_noise)
                 pipe.send(make_row(instance, policy, repeat, outcome))
 
 
