@@ -11,18 +11,20 @@ from osel_sim.errors import DataError, OselError, UsageError
 from osel_sim.run import DEFAULT_PRESET, NOISE_HELP, SPLITS
 
 if TYPE_CHECKING:
+    from osel_sim.formats.rollout_log import Row
     from osel_sim.formats.shards import Shards
-    from osel_sim.runtime.workers import Plan
+    from osel_sim.runtime.workers import Episode, Plan
 
 EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine --resume     # go on after an interruption
+  python -m osel_sim.record --task pick_place --instances 200 --out logs/mine --resume --policies local_small remote_large mine   # add a policy
   python -m osel_sim.record --task pick_place --instances 50 --repeats 4 --workers 8 --policies local_small --out logs/small
   python -m osel_sim.record --task all --instances 300 --level 0 1 2 3 --repeats 3 --repeat-every 10 --out logs/suite
   python -m osel_sim.record --summary logs/mine                                            # print the tables of a log again
 
 Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.npz. Every policy starts from the same state of the same instance. The
-files do not depend on the number of workers, nor on interruptions."""
+files do not depend on the number of workers, nor on interruptions. With --resume, --policies may name more than before: they are recorded as well."""
 
 
 @cli.main
@@ -52,7 +54,7 @@ def parser() -> cli.Parser:
     add("--start-seed", type=cli.non_negative_int, default=0, metavar="S", help="seed of the first instance (default: %(default)s)")
     add("--encoder", metavar="NAME", help="osel_small (default), MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
     add("--out", type=Path, metavar="DIR", help="where to write")
-    add("--resume", action="store_true", help="go on with the recording in --out")
+    add("--resume", action="store_true", help="go on with the recording in --out, or add policies to it")
     add("--summary", type=cli.folder, metavar="DIR", help="print the tables of the log in DIR, and leave")
     add("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
     add("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
@@ -62,8 +64,7 @@ def parser() -> cli.Parser:
 def _record(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.formats.rollout_log import ROLLOUTS
-    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, start_or_resume
+    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, read_json, start_or_resume, write_json
     from osel_sim.formats.shards import Shards
     from osel_sim.runtime.drivers import choose_policies, with_fallbacks
     from osel_sim.runtime.workers import Plan
@@ -103,45 +104,79 @@ def _record(options: argparse.Namespace) -> int:
         "split": options.split,
         "content": content_digests(tasks, everyone),
     }
-    check_folder(folder, configuration, options.resume)
+    before = read_json(folder / RUN) if options.resume and (folder / RUN).exists() else None
+    known = configuration if before is None else _without_added_policies(configuration, before.get("configuration", {}))
+    check_folder(folder, known, options.resume)
     encoder = load_encoder(encoder_name)
-    configuration["encoder"] = encoder.identity
+    configuration["encoder"] = known["encoder"] = encoder.identity
     ran_with = environment(choose_backend(), content.root())
-    for warning in start_or_resume(folder, configuration, ran_with, options.resume):
+    for warning in start_or_resume(folder, known, ran_with, options.resume):
         print(f"warning: {warning}", file=sys.stderr)
-    if (folder / ROLLOUTS).exists():
+    there = _logged(folder)
+    if there.keys() == plan.instances.keys() and all(rows.keys() == set(plan.episodes(instance)) for instance, rows in there.items()):
         print(f"{folder} is complete")
     else:
+        if before is not None:
+            write_json(folder / RUN, before | {"configuration": configuration})
         shards = Shards(folder)
+        for instance, rows in shards.rows.items():
+            there.setdefault(instance, {}).update(rows)
+        recorded = len(shards)
         try:
-            _record_missing(plan, shards, options.workers)
+            _record_missing(plan, there, shards, options.workers)
         except OselError:
-            if not shards.rows:  # the folder is not in use: nothing came of it, such as for want of a checkpoint
-                shards.close(remove=True)
-                (folder / RUN).unlink()
+            if len(shards) == recorded:  # nothing came of it, such as for want of a checkpoint: the folder is as it was
+                shards.close(remove=not recorded)
+                (folder / RUN).unlink() if before is None else write_json(folder / RUN, before)
             raise
-        _finish(folder, plan, shards, encoder.identity, configuration)
+        _finish(folder, plan, there, shards, encoder.identity, configuration)
     _print_summary(folder)
     return 0
 
 
-def _record_missing(plan: "Plan", shards: "Shards", workers: int) -> None:
-    """Record what is not there yet, with a progress bar."""
+def _without_added_policies(configuration: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
+    """The configuration without the policies that a recording did not have at its beginning; as it is, unless it has all of those and more.
+
+    Args:
+        before: what the recording began with.
+    """
+    policies, content_then = before.get("policies", []), before.get("content", {})
+    added = set(configuration["policies"]) - set(policies)
+    if not added or not set(policies) < set(configuration["policies"]):
+        return dict(configuration)
+    digests = {key: value for key, value in configuration["content"].items() if key in content_then or key.partition(" ")[2] not in added}
+    return configuration | {"policies": policies, "content": digests}
+
+
+def _logged(folder: Path) -> dict[str, "dict[Episode, Row]"]:
+    """Rows of the folder's rollout log, by instance and episode; none if it has no log yet."""
+    from osel_sim.formats.rollout_log import ROLLOUTS, read_rollouts
+
+    result: dict[str, dict[Episode, Row]] = {}
+    if (folder / ROLLOUTS).exists():
+        for row in read_rollouts(folder)[0]:
+            result.setdefault(row.instance, {})[row.policy, row.repeat] = row
+    return result
+
+
+def _record_missing(plan: "Plan", there: dict[str, "dict[Episode, Row]"], shards: "Shards", workers: int) -> None:
+    """Record what is not there yet, with a progress bar, and add it."""
     from tqdm import tqdm  # type: ignore[import-untyped]
 
     from osel_sim.runtime.workers import record
 
-    missing = [instance for instance in plan.instances if instance not in shards.rows]
-    total, there = (sum(len(plan.episodes(instance)) for instance in instances) for instances in (plan.instances, shards.rows))
+    missing = {instance: [episode for episode in plan.episodes(instance) if episode not in there.get(instance, {})] for instance in plan.instances}
+    total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
     start = time.perf_counter()
     done = successes = 0
-    with tqdm(total=total, initial=there, unit="episode", dynamic_ncols=True) as bar:
-        for recorded in record(plan, missing, workers):
+    with tqdm(total=total, initial=total - left, unit="episode", dynamic_ncols=True) as bar:
+        for recorded in record(plan, {instance: episodes for instance, episodes in missing.items() if episodes}, workers):
             if recorded is None:
                 bar.update()
                 continue
-            rows = [recorded.rows[episode] for episode in plan.episodes(recorded.instance)]
+            rows = [recorded.rows[episode] for episode in missing[recorded.instance]]
             shards.add(recorded.instance, rows, recorded.context)
+            there.setdefault(recorded.instance, {}).update(recorded.rows)
             done += len(rows)
             successes += sum(row.success for row in rows)
             bar.set_postfix_str(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h", refresh=False)
@@ -150,8 +185,10 @@ def _record_missing(plan: "Plan", shards: "Shards", workers: int) -> None:
         print(f"{done} episodes in {seconds:.0f} s with {workers} workers: {3600 * done / seconds:.0f} episodes an hour, starting up included")
 
 
-def _finish(folder: Path, plan: "Plan", shards: "Shards", encoder: str, configuration: dict[str, Any]) -> None:
-    """Turn the shards into the rollout log and its contexts."""
+def _finish(
+    folder: Path, plan: "Plan", there: dict[str, "dict[Episode, Row]"], shards: "Shards", encoder: str, configuration: dict[str, Any]
+) -> None:
+    """Turn what is there into the rollout log and its contexts."""
     from osel_sim.context.cache import ContextCache
     from osel_sim.formats.rollout_log import write_rollouts
 
@@ -160,7 +197,8 @@ def _finish(folder: Path, plan: "Plan", shards: "Shards", encoder: str, configur
         if instance in shards.contexts:
             cache.put(encoder, instance, shards.contexts[instance])
     cache.save()
-    write_rollouts(folder, [row for instance in plan.instances for row in shards.rows[instance]], configuration)
+    rows = [there[instance][episode] for instance in plan.instances for episode in plan.episodes(instance)]
+    write_rollouts(folder, rows, configuration)
     shards.close(remove=True)
 
 

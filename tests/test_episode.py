@@ -153,6 +153,22 @@ def test_async_asks_again_at_once_when_the_answer_is_older_than_execute(env, ins
     assert made(env)[: len(expected)] == expected
 
 
+def test_noise_on_actions_is_of_the_repeat_and_spares_gripper_and_waiting(env, instance):
+    def play(repeat, noise):
+        env.load(instance)
+        run_episode(env, instance, Driver(spec(mode="blocking"), Numbered(inference=0.2)), repeat=repeat, action_noise=noise)
+        return np.array(env.made)
+
+    clean, noisy, again, other = play(0, 0.0), play(0, 0.05), play(0, 0.05), play(1, 0.05)
+    waiting = clean[:, 6] == 0.0
+    assert waiting[:4].all()
+    assert np.array_equal(noisy, again)
+    assert not np.array_equal(noisy, other)
+    assert np.array_equal(noisy[waiting], clean[waiting])
+    assert np.array_equal(noisy[:, 6], clean[:, 6])
+    assert 0.03 < (noisy - clean)[~waiting, :6].std() < 0.07
+
+
 def test_a_chunk_shorter_than_execute_is_used_up(env, instance):
     outcome = run_episode(env, instance, Driver(spec(execute=8), Numbered(length=4)))
     assert outcome.calls == HORIZON / 4

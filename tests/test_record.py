@@ -1,6 +1,7 @@
 """`python -m osel_sim.record` with real workers and servers: the same bytes however it went, and a dying worker costs one episode."""
 
 import json
+import shutil
 import signal
 import subprocess
 from pathlib import Path
@@ -80,6 +81,43 @@ def test_one_worker_killed_with_its_parent_and_resumed_by_two_writes_the_same_by
     done = execute(world, "record", *arguments, "--workers", 2, "--resume")
     assert done.returncode == 0, done.stderr
     assert files(folder) == files(reference[0])
+
+
+def test_a_policy_added_to_a_log_or_to_half_a_recording_gives_the_bytes_of_all_at_once(world, reference):
+    folder = world / "grown"
+    first, both = ([*SIZE, "--out", folder, "--workers", 1, "--policies", *policies] for policies in (("calm",), ("calm", "wild")))
+    process = subprocess.Popen(command(world, "record", *first), env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_for_lines(process, folder / "shards.jsonl", 2)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    half = world / "half"
+    shutil.copytree(folder, half)
+    assert execute(world, "record", *first, "--resume").returncode == 0
+    assert {row.policy for row in read_rollouts(folder)[0]} == {"calm"}
+    for place in (folder, half):
+        done = execute(world, "record", *both, "--out", place, "--resume")
+        assert done.returncode == 0, done.stderr
+        assert files(place) == files(reference[0])
+        assert json.loads((place / "run.json").read_text())["configuration"] == json.loads((reference[0] / "run.json").read_text())["configuration"]
+
+
+def test_a_policy_that_cannot_be_added_leaves_the_log_as_it_was(world, reference, capsys):
+    folder = world / "kept"
+    shutil.copytree(reference[0], folder)
+    more = world / "more"
+    shutil.copytree(world / "policies", more)
+    lost = (
+        (more / "calm.toml")
+        .read_text()
+        .replace('name = "calm"', 'name = "lost"')
+        .replace('kind = "calm"', 'kind = "lerobot"\ncheckpoint = "nowhere/at/all"')
+    )
+    (more / "lost.toml").write_text(lost)
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    more_policies = ("--policies-dir", more, "--policies", "calm", "wild", "lost")
+    assert record.main(list(map(str, command(world, "record", *SIZE, "--out", folder, "--resume", *more_policies)[3:]))) == 2
+    assert "nowhere/at/all" in capsys.readouterr().err
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
 
 def test_a_dying_worker_costs_one_episode(world, reference):

@@ -165,7 +165,8 @@ def test_shards_come_back_and_a_torn_one_is_dropped(tmp_path):
     file = tmp_path / SHARDS
     file.write_bytes(file.read_bytes() + b'{"seed": 6, "rows": [')
     again = Shards(tmp_path)
-    assert again.rows == {5: [row(5), row(5, "large")], 4: [row(4)]}
+    assert again.rows == {5: {("small", 0): row(5), ("large", 0): row(5, "large")}, 4: {("small", 0): row(4)}}
+    assert len(again) == 3
     assert list(again.contexts) == [5]
     assert np.array_equal(again.contexts[5], context)
     assert again.contexts[5].dtype == np.float32

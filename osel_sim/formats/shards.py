@@ -1,6 +1,6 @@
-"""What a recording has so far: `shards.jsonl`, one complete instance a line with its context, on disk as soon as it is there.
+"""What a recording has beyond its rollout log: `shards.jsonl`, one instance a line with its context, on disk as soon as it is there.
 
-It is replaced by the rollout log when all instances are recorded.
+It goes into the rollout log when all instances are recorded. An instance has a second line if policies were added to the recording meanwhile.
 """
 
 import base64
@@ -17,33 +17,40 @@ SHARDS = "shards.jsonl"
 
 
 class Shards:
-    """Complete instances by key.
+    """Recorded instances by key.
 
     Attributes:
-        rows: instance -> rows, in the order policy, repeat.
+        rows: instance -> its rows, by policy and repeat.
         contexts: instance -> context (d,); absent where a worker died before it was made.
     """
 
     def __init__(self, folder: Path) -> None:
         self._lines = Lines(folder / SHARDS)
-        self.rows: dict[str, list[Row]] = {}
+        self.rows: dict[str, dict[tuple[str, int], Row]] = {}
         self.contexts: dict[str, NDArray[np.float32]] = {}
         for number, (data, _) in enumerate(self._lines.rows, 1):
             try:
                 key, context = data["instance"], data["context"]
-                self.rows[key] = [Row(**row) for row in data["rows"]]
+                self._put(key, [Row(**row) for row in data["rows"]])
                 if context is not None:
                     self.contexts[key] = np.frombuffer(base64.b64decode(context), "<f4").astype(np.float32)
             except (KeyError, TypeError, ValueError) as error:
                 raise DataError(f"{self._lines.file}, line {number}: not a recorded instance ({error})") from None
 
+    def __len__(self) -> int:
+        """Number of rows."""
+        return sum(map(len, self.rows.values()))
+
     def add(self, instance: str, rows: list[Row], context: NDArray[np.float32] | None) -> None:
         """Write one instance and wait until it is on disk."""
         encoded = None if context is None else base64.b64encode(context.astype("<f4").tobytes()).decode()
         self._lines.append({"instance": instance, "rows": [vars(row) for row in rows], "context": encoded})
-        self.rows[instance] = rows
+        self._put(instance, rows)
         if context is not None:
             self.contexts[instance] = context
+
+    def _put(self, instance: str, rows: list[Row]) -> None:
+        self.rows.setdefault(instance, {}).update({(row.policy, row.repeat): row for row in rows})
 
     def close(self, remove: bool) -> None:
         """Close the file, and delete it once the rollout log holds everything."""

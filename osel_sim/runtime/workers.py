@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+Episode = tuple[str, int]
+"""Policy and repeat."""
+
+
 @dataclass(frozen=True)
 class Plan:
     """What is to be recorded; the same for all workers.
@@ -60,8 +64,8 @@ class Plan:
         drawn = (make_instance(task, seed, self.levels[seed % len(self.levels)], self.split, self.axes) for task in self.tasks for seed in self.seeds)
         return {instance.key: instance for instance in drawn}
 
-    def episodes(self, instance: str) -> list[tuple[str, int]]:
-        """(policy, repeat) of the instance of this key, in the order of rows."""
+    def episodes(self, instance: str) -> list[Episode]:
+        """Those of the instance of this key, in the order of rows."""
         turn = self.instances[instance].seed // len(self.levels)  # of all levels once: counting seeds would repeat some levels and never others
         repeats = self.repeats if turn % self.repeat_every == 0 else 1
         return [(spec.name, repeat) for spec in self.policies for repeat in range(repeats)]
@@ -69,33 +73,33 @@ class Plan:
 
 @dataclass
 class Recorded:
-    """One instance, completely recorded. `context` is None if the worker died before it was made."""
+    """One instance with the episodes asked for. `context` is None if the worker died before it was made."""
 
     instance: str
-    rows: dict[tuple[str, int], Row] = field(default_factory=dict)
+    rows: dict[Episode, Row] = field(default_factory=dict)
     context: "NDArray[np.float32] | None" = None
 
 
-def record(plan: Plan, instances: Sequence[str], workers: int) -> Iterator[Recorded | None]:
-    """Record the instances of these keys, each yielded when it is complete, in no particular order; None for every episode in between.
+def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int) -> Iterator[Recorded | None]:
+    """Record these episodes, by instance, each instance yielded when all of its are there, in no particular order; None for every episode in between.
 
     Raises:
         OselError: a worker cannot start.
     """
-    todo: queue.SimpleQueue[str] = queue.SimpleQueue()
+    todo: queue.SimpleQueue[tuple[str, Sequence[Episode]]] = queue.SimpleQueue()
     results: queue.SimpleQueue[Recorded | Exception | None] = queue.SimpleQueue()
-    for key in instances:
-        todo.put(key)
-    crew = [_Supervisor(plan, todo, results) for _ in range(min(workers, len(instances)))]
-    missing = len(instances)
+    for work in missing.items():
+        todo.put(work)
+    crew = [_Supervisor(plan, todo, results) for _ in range(min(workers, len(missing)))]
+    left = len(missing)
     try:
         for supervisor in crew:
             supervisor.start()
-        while missing:
+        while left:
             result = results.get()
             if isinstance(result, Exception):
                 raise result
-            missing -= result is not None
+            left -= result is not None
             yield result
     finally:
         for supervisor in crew:
@@ -105,7 +109,9 @@ def record(plan: Plan, instances: Sequence[str], workers: int) -> Iterator[Recor
 class _Supervisor(threading.Thread):
     """Hands instances to a worker process of its own, and starts another when that dies."""
 
-    def __init__(self, plan: Plan, todo: "queue.SimpleQueue[str]", results: "queue.SimpleQueue[Recorded | Exception | None]") -> None:
+    def __init__(
+        self, plan: Plan, todo: "queue.SimpleQueue[tuple[str, Sequence[Episode]]]", results: "queue.SimpleQueue[Recorded | Exception | None]"
+    ) -> None:
         super().__init__(daemon=True)
         self._plan, self._todo, self._results = plan, todo, results
         self._process: SpawnProcess | None = None
@@ -115,7 +121,7 @@ class _Supervisor(threading.Thread):
     def run(self) -> None:
         try:
             while not self._stopped:
-                self._record(self._todo.get_nowait())
+                self._record(*self._todo.get_nowait())
         except queue.Empty:
             self.stop()
         except Exception as error:
@@ -128,9 +134,8 @@ class _Supervisor(threading.Thread):
         if self._process is not None:
             self._process.kill()
 
-    def _record(self, instance: str) -> None:
+    def _record(self, instance: str, episodes: Sequence[Episode]) -> None:
         recorded = Recorded(instance)
-        episodes = self._plan.episodes(instance)
         while missing := [episode for episode in episodes if episode not in recorded.rows]:
             pipe = self._pipe or self._hire()
             try:
