@@ -3,6 +3,7 @@
 import argparse
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +12,7 @@ from osel_sim.errors import DataError, OselError, UsageError
 from osel_sim.run import DEFAULT_PRESET, NOISE_HELP, SPLITS
 
 if TYPE_CHECKING:
-    from osel_sim.formats.rollout_log import Row
-    from osel_sim.formats.shards import Shards
-    from osel_sim.runtime.workers import Episode, Plan
+    from osel_sim.runtime.recording import Recording
 
 EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine
@@ -24,7 +23,8 @@ EXAMPLES = """examples:
   python -m osel_sim.record --summary logs/mine                                            # print the tables of a log again
 
 Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.npz. Every policy starts from the same state of the same instance. The
-files do not depend on the number of workers, nor on interruptions. With --resume, --policies may name more than before: they are recorded as well."""
+files do not depend on the number of workers, nor on interruptions. With --resume, --policies may name more than before, which are recorded as
+well, and --encoder another, whose contexts are added."""
 
 
 @cli.main
@@ -54,7 +54,7 @@ def parser() -> cli.Parser:
     add("--start-seed", type=cli.non_negative_int, default=0, metavar="S", help="seed of the first instance (default: %(default)s)")
     add("--encoder", metavar="NAME", help="osel_small (default), MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
     add("--out", type=Path, metavar="DIR", help="where to write")
-    add("--resume", action="store_true", help="go on with the recording in --out, or add policies to it")
+    add("--resume", action="store_true", help="go on with the recording in --out, or add policies or an encoder's contexts to it")
     add("--summary", type=cli.folder, metavar="DIR", help="print the tables of the log in DIR, and leave")
     add("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
     add("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
@@ -65,8 +65,8 @@ def _record(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
     from osel_sim.formats.levels import parse_axes
     from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, read_json, start_or_resume, write_json
-    from osel_sim.formats.shards import Shards
     from osel_sim.runtime.drivers import choose_policies, with_fallbacks
+    from osel_sim.runtime.recording import Recording
     from osel_sim.runtime.workers import Plan
     from osel_sim.sim.gl import choose_backend
 
@@ -105,101 +105,71 @@ def _record(options: argparse.Namespace) -> int:
         "content": content_digests(tasks, everyone),
     }
     before = read_json(folder / RUN) if options.resume and (folder / RUN).exists() else None
-    known = configuration if before is None else _without_added_policies(configuration, before.get("configuration", {}))
+    known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
     check_folder(folder, known, options.resume)
     encoder = load_encoder(encoder_name)
-    configuration["encoder"] = known["encoder"] = encoder.identity
+    configuration["encoder"] = encoder.identity
     ran_with = environment(choose_backend(), content.root())
-    for warning in start_or_resume(folder, known, ran_with, options.resume):
+    for warning in start_or_resume(folder, known if before else configuration, ran_with, options.resume):
         print(f"warning: {warning}", file=sys.stderr)
-    there = _logged(folder)
-    if there.keys() == plan.instances.keys() and all(rows.keys() == set(plan.episodes(instance)) for instance, rows in there.items()):
+    recording = Recording(folder, plan, encoder.identity)
+    if recording.complete:
         print(f"{folder} is complete")
     else:
         if before is not None:
             write_json(folder / RUN, before | {"configuration": configuration})
-        shards = Shards(folder)
-        for instance, rows in shards.rows.items():
-            there.setdefault(instance, {}).update(rows)
-        recorded = len(shards)
         try:
-            _record_missing(plan, there, shards, options.workers)
+            _record_missing(recording, options.workers)
         except OselError:
-            if len(shards) == recorded:  # nothing came of it, such as for want of a checkpoint: the folder is as it was
-                shards.close(remove=not recorded)
+            if not recording.grew:  # nothing came of it, such as for want of a checkpoint: the folder is as it was
                 (folder / RUN).unlink() if before is None else write_json(folder / RUN, before)
             raise
-        _finish(folder, plan, there, shards, encoder.identity, configuration)
+        recording.finish(configuration)
     _print_summary(folder)
     return 0
 
 
-def _without_added_policies(configuration: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """The configuration without the policies that a recording did not have at its beginning; as it is, unless it has all of those and more.
+def _as_it_began(configuration: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
+    """The configuration as it would have been without what a recording may be given later on: more policies, and contexts of another encoder.
 
     Args:
         before: what the recording began with.
     """
+    known = configuration | {"encoder": before.get("encoder")}
     policies, content_then = before.get("policies", []), before.get("content", {})
     added = set(configuration["policies"]) - set(policies)
-    if not added or not set(policies) < set(configuration["policies"]):
-        return dict(configuration)
-    digests = {key: value for key, value in configuration["content"].items() if key in content_then or key.partition(" ")[2] not in added}
-    return configuration | {"policies": policies, "content": digests}
+    if added and set(policies) < set(configuration["policies"]):
+        digests = {key: value for key, value in configuration["content"].items() if key in content_then or key.partition(" ")[2] not in added}
+        known |= {"policies": policies, "content": digests}
+    return known
 
 
-def _logged(folder: Path) -> dict[str, "dict[Episode, Row]"]:
-    """Rows of the folder's rollout log, by instance and episode; none if it has no log yet."""
-    from osel_sim.formats.rollout_log import ROLLOUTS, read_rollouts
-
-    result: dict[str, dict[Episode, Row]] = {}
-    if (folder / ROLLOUTS).exists():
-        for row in read_rollouts(folder)[0]:
-            result.setdefault(row.instance, {})[row.policy, row.repeat] = row
-    return result
-
-
-def _record_missing(plan: "Plan", there: dict[str, "dict[Episode, Row]"], shards: "Shards", workers: int) -> None:
+def _record_missing(recording: "Recording", workers: int) -> None:
     """Record what is not there yet, with a progress bar, and add it."""
     from tqdm import tqdm  # type: ignore[import-untyped]
 
     from osel_sim.runtime.workers import record
 
-    missing = {instance: [episode for episode in plan.episodes(instance) if episode not in there.get(instance, {})] for instance in plan.instances}
+    plan, missing = recording.plan, recording.missing()
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
+    unit = "episode" if left else "context"
     start = time.perf_counter()
     done = successes = 0
-    with tqdm(total=total, initial=total - left, unit="episode", dynamic_ncols=True) as bar:
-        for recorded in record(plan, {instance: episodes for instance, episodes in missing.items() if episodes}, workers):
+    with tqdm(total=total if left else len(missing), initial=total - left if left else 0, unit=unit, dynamic_ncols=True) as bar:
+        for recorded in record(plan if left else replace(plan, everyone=()), missing, workers):  # contexts alone need no policy
             if recorded is None:
                 bar.update()
                 continue
-            rows = [recorded.rows[episode] for episode in missing[recorded.instance]]
-            shards.add(recorded.instance, rows, recorded.context)
-            there.setdefault(recorded.instance, {}).update(recorded.rows)
+            rows = recording.add(recorded)
+            if not left:
+                bar.update()
+                continue
             done += len(rows)
             successes += sum(row.success for row in rows)
             bar.set_postfix_str(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h", refresh=False)
     if done:
         seconds = time.perf_counter() - start
         print(f"{done} episodes in {seconds:.0f} s with {workers} workers: {3600 * done / seconds:.0f} episodes an hour, starting up included")
-
-
-def _finish(
-    folder: Path, plan: "Plan", there: dict[str, "dict[Episode, Row]"], shards: "Shards", encoder: str, configuration: dict[str, Any]
-) -> None:
-    """Turn what is there into the rollout log and its contexts."""
-    from osel_sim.context.cache import ContextCache
-    from osel_sim.formats.rollout_log import write_rollouts
-
-    cache = ContextCache(folder, autosave=0)
-    for instance in plan.instances:
-        if instance in shards.contexts:
-            cache.put(encoder, instance, shards.contexts[instance])
-    cache.save()
-    rows = [there[instance][episode] for instance in plan.instances for episode in plan.episodes(instance)]
-    write_rollouts(folder, rows, configuration)
-    shards.close(remove=True)
 
 
 def _print_summary(folder: Path) -> None:

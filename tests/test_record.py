@@ -14,6 +14,7 @@ from osel_sim import content, record
 from osel_sim.context.cache import ContextCache
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.offline.log import read_log
 from osel_sim.runtime.workers import Plan
 
 INSTANCES, REPEATS = 5, 2
@@ -99,6 +100,21 @@ def test_a_policy_added_to_a_log_or_to_half_a_recording_gives_the_bytes_of_all_a
         assert done.returncode == 0, done.stderr
         assert files(place) == files(reference[0])
         assert json.loads((place / "run.json").read_text())["configuration"] == json.loads((reference[0] / "run.json").read_text())["configuration"]
+
+
+def test_contexts_of_another_encoder_are_added(world, reference):
+    folder = world / "encoded"
+    shutil.copytree(reference[0], folder)
+    done = execute(world, "record", *SIZE, "--out", folder, "--resume", "--encoder", "osel_small")
+    assert done.returncode == 0, done.stderr
+    assert "episodes in" not in done.stdout
+    rows, metadata = read_rollouts(folder)
+    assert rows == read_rollouts(reference[0])[0]
+    assert metadata["encoder"].startswith("osel_small@")
+    keys, old, new = list(dict.fromkeys(row.instance for row in rows)), ContextCache(reference[0]), ContextCache(folder)
+    assert np.array_equal(new.table("colours", keys), old.table("colours", keys))
+    assert len(np.unique(new.table("osel_small", keys), axis=0)) == INSTANCES
+    assert read_log(folder).encoder == metadata["encoder"]
 
 
 def test_a_policy_that_cannot_be_added_leaves_the_log_as_it_was(world, reference, capsys):

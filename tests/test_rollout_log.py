@@ -159,17 +159,17 @@ def test_reward_of_logged_rows_by_hand():
 def test_shards_come_back_and_a_torn_one_is_dropped(tmp_path):
     shards = Shards(tmp_path)
     context = np.linspace(-1, 1, 7, dtype=np.float32) / 3
-    shards.add(5, [row(5), row(5, "large")], context)
-    shards.add(4, [row(4)], None)
+    shards.add(5, [row(5), row(5, "large")], "e@1", context)
+    shards.add(4, [row(4)], "e@1", None)
     shards.close(remove=False)
     file = tmp_path / SHARDS
     file.write_bytes(file.read_bytes() + b'{"seed": 6, "rows": [')
     again = Shards(tmp_path)
     assert again.rows == {5: {("small", 0): row(5), ("large", 0): row(5, "large")}, 4: {("small", 0): row(4)}}
-    assert len(again) == 3
-    assert list(again.contexts) == [5]
-    assert np.array_equal(again.contexts[5], context)
-    assert again.contexts[5].dtype == np.float32
+    assert list(again.contexts) == ["e@1"]
+    assert list(again.contexts["e@1"]) == [5]
+    assert np.array_equal(again.contexts["e@1"][5], context)
+    assert again.contexts["e@1"][5].dtype == np.float32
     again.close(remove=True)
     assert not file.exists()
 

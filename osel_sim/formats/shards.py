@@ -1,6 +1,6 @@
 """What a recording has beyond its rollout log: `shards.jsonl`, one instance a line with its context, on disk as soon as it is there.
 
-It goes into the rollout log when all instances are recorded. An instance has a second line if policies were added to the recording meanwhile.
+It goes into the rollout log when all instances are recorded. An instance has several lines if policies or an encoder were added meanwhile.
 """
 
 import base64
@@ -21,33 +21,29 @@ class Shards:
 
     Attributes:
         rows: instance -> its rows, by policy and repeat.
-        contexts: instance -> context (d,); absent where a worker died before it was made.
+        contexts: encoder's identity -> instance -> context (d,); absent where a worker died before it was made.
     """
 
     def __init__(self, folder: Path) -> None:
         self._lines = Lines(folder / SHARDS)
         self.rows: dict[str, dict[tuple[str, int], Row]] = {}
-        self.contexts: dict[str, NDArray[np.float32]] = {}
+        self.contexts: dict[str, dict[str, NDArray[np.float32]]] = {}
         for number, (data, _) in enumerate(self._lines.rows, 1):
             try:
-                key, context = data["instance"], data["context"]
+                key, encoder, context = data["instance"], data["encoder"], data["context"]
                 self._put(key, [Row(**row) for row in data["rows"]])
                 if context is not None:
-                    self.contexts[key] = np.frombuffer(base64.b64decode(context), "<f4").astype(np.float32)
+                    self.contexts.setdefault(encoder, {})[key] = np.frombuffer(base64.b64decode(context), "<f4").astype(np.float32)
             except (KeyError, TypeError, ValueError) as error:
                 raise DataError(f"{self._lines.file}, line {number}: not a recorded instance ({error})") from None
 
-    def __len__(self) -> int:
-        """Number of rows."""
-        return sum(map(len, self.rows.values()))
-
-    def add(self, instance: str, rows: list[Row], context: NDArray[np.float32] | None) -> None:
+    def add(self, instance: str, rows: list[Row], encoder: str, context: NDArray[np.float32] | None) -> None:
         """Write one instance and wait until it is on disk."""
         encoded = None if context is None else base64.b64encode(context.astype("<f4").tobytes()).decode()
-        self._lines.append({"instance": instance, "rows": [vars(row) for row in rows], "context": encoded})
+        self._lines.append({"instance": instance, "rows": [vars(row) for row in rows], "encoder": encoder, "context": encoded})
         self._put(instance, rows)
         if context is not None:
-            self.contexts[instance] = context
+            self.contexts.setdefault(encoder, {})[instance] = context
 
     def _put(self, instance: str, rows: list[Row]) -> None:
         self.rows.setdefault(instance, {}).update({(row.policy, row.repeat): row for row in rows})

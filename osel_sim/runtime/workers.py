@@ -83,6 +83,8 @@ class Recorded:
 def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int) -> Iterator[Recorded | None]:
     """Record these episodes, by instance, each instance yielded when all of its are there, in no particular order; None for every episode in between.
 
+    Every instance gets its context as well, also one without episodes.
+
     Raises:
         OselError: a worker cannot start.
     """
@@ -135,8 +137,8 @@ class _Supervisor(threading.Thread):
             self._process.kill()
 
     def _record(self, instance: str, episodes: Sequence[Episode]) -> None:
-        recorded = Recorded(instance)
-        while missing := [episode for episode in episodes if episode not in recorded.rows]:
+        recorded, missing = Recorded(instance), list(episodes)
+        while True:
             pipe = self._pipe or self._hire()
             try:
                 pipe.send((instance, missing))
@@ -147,9 +149,15 @@ class _Supervisor(threading.Thread):
             except (EOFError, OSError):
                 if self._stopped:
                     return
-                policy, repeat = next(episode for episode in missing if episode not in recorded.rows)
-                recorded.rows[policy, repeat] = error_row(self._plan, instance, policy, repeat, f"the worker process died ({self._dismiss()})")
-                self._results.put(None)
+                died = self._dismiss()
+                missing = [episode for episode in episodes if episode not in recorded.rows]
+                if missing:
+                    policy, repeat = missing.pop(0)
+                    recorded.rows[policy, repeat] = error_row(self._plan, instance, policy, repeat, f"the worker process died ({died})")
+                    self._results.put(None)
+                if missing:
+                    continue
+            break
         self._results.put(recorded)
 
     def _hire(self) -> Connection:

@@ -1,0 +1,77 @@
+"""A recording in its folder: what is there of a plan, what is missing, and how it becomes a rollout log."""
+
+from pathlib import Path
+from typing import Any
+
+from osel_sim.context.cache import ContextCache
+from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
+from osel_sim.formats.shards import SHARDS, Shards
+from osel_sim.runtime.workers import Episode, Plan, Recorded
+
+
+class Recording:
+    """What a folder holds of a plan: in its rollout log and contexts if it has those already, and in the shards beside them.
+
+    Args:
+        encoder: identity of the one whose contexts are wanted.
+
+    Attributes:
+        grew: something was added.
+    """
+
+    def __init__(self, folder: Path, plan: Plan, encoder: str) -> None:
+        self.folder, self.plan, self.encoder, self.grew = folder, plan, encoder, False
+        self._cache = ContextCache(folder, autosave=0)
+        self._rows: dict[str, dict[Episode, Row]] = {}
+        for row in read_rollouts(folder)[0] if (folder / ROLLOUTS).exists() else ():
+            self._rows.setdefault(row.instance, {})[row.policy, row.repeat] = row
+        self._shards = Shards(folder) if (folder / SHARDS).exists() else None
+        if self._shards is not None:
+            for instance, rows in self._shards.rows.items():
+                self._rows.setdefault(instance, {}).update(rows)
+
+    @property
+    def complete(self) -> bool:
+        """The rollout log and its contexts hold everything."""
+        return self._shards is None and not self.missing()
+
+    def missing(self) -> dict[str, list[Episode]]:
+        """Episodes that are not there, by instance; an instance that lacks only its context has none."""
+        result = {}
+        for instance in self.plan.instances:
+            there = self._rows.get(instance, {})
+            episodes = [episode for episode in self.plan.episodes(instance) if episode not in there]
+            if episodes or not self._has_context(instance):
+                result[instance] = episodes
+        return result
+
+    def add(self, recorded: Recorded) -> list[Row]:
+        """Take in an instance, and wait until it is on disk. Returns its new rows in the plan's order."""
+        rows = [recorded.rows[episode] for episode in self.plan.episodes(recorded.instance) if episode in recorded.rows]
+        if self._shards is None:
+            self._shards = Shards(self.folder)
+        self._shards.add(recorded.instance, rows, self.encoder, recorded.context)
+        self._rows.setdefault(recorded.instance, {}).update(recorded.rows)
+        self.grew = True
+        return rows
+
+    def finish(self, configuration: dict[str, Any]) -> None:
+        """Turn what is there into the rollout log and its contexts.
+
+        Args:
+            configuration: goes into the log's metadata.
+        """
+        if self._shards is not None:
+            for encoder, contexts in self._shards.contexts.items():
+                for instance in self.plan.instances:
+                    if instance in contexts:
+                        self._cache.put(encoder, instance, contexts[instance])
+            self._cache.save()
+        write_rollouts(self.folder, [self._rows[key][episode] for key in self.plan.instances for episode in self.plan.episodes(key)], configuration)
+        if self._shards is not None:
+            self._shards.close(remove=True)
+            self._shards = None
+
+    def _has_context(self, instance: str) -> bool:
+        in_shards = self._shards is not None and instance in self._shards.contexts.get(self.encoder, {})
+        return in_shards or self._cache.get(self.encoder, instance) is not None
