@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 
 EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine
-  python -m osel_sim.record --task pick_place --instances 200 --out logs/mine --resume     # go on after an interruption
-  python -m osel_sim.record --task pick_place --instances 200 --out logs/mine --resume --policies local_small remote_large mine   # add a policy
+  python -m osel_sim.record --resume --out logs/mine                                       # go on after an interruption
+  python -m osel_sim.record --resume --out logs/mine --policies another                    # record one more policy on the same instances
+  python -m osel_sim.record --resume --out logs/mine --encoder ViT-L-14:openai             # add contexts of another encoder
   python -m osel_sim.record --task pick_place --instances 50 --repeats 4 --workers 8 --policies local_small --out logs/small
   python -m osel_sim.record --task all --instances 300 --level 0 1 2 3 --repeats 3 --repeat-every 10 --out logs/suite
   python -m osel_sim.record --summary logs/mine                                            # print the tables of a log again
 
 Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.npz. Every policy starts from the same state of the same instance. The
-files do not depend on the number of workers, nor on interruptions. With --resume, --policies may name more than before, which are recorded as
-well, and --encoder another, whose contexts are added."""
+files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies and an encoder
+given with it are added to what is there."""
 
 
 @cli.main
@@ -70,6 +71,9 @@ def _record(options: argparse.Namespace) -> int:
     from osel_sim.runtime.workers import Plan
     from osel_sim.sim.gl import choose_backend
 
+    if options.resume and not options.task and options.out is not None:
+        check_folder(options.out, {}, resume=True)
+        _take_settings(options, read_json(options.out / RUN).get("configuration", {}))
     tasks = content.select_tasks(options.task, options.tasks)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
@@ -127,6 +131,22 @@ def _record(options: argparse.Namespace) -> int:
         recording.finish(configuration)
     _print_summary(folder)
     return 0
+
+
+def _take_settings(options: argparse.Namespace, configuration: dict[str, Any]) -> None:
+    """Set the options to those that a recording began with; policies and encoder that were given come in addition."""
+    try:
+        options.task = configuration["tasks"]
+        options.level = configuration["levels"]
+        options.axis = [part for axes in configuration["axes"] for part in axes.split(",")]
+        options.policies = list(dict.fromkeys([*configuration["policies"], *(options.policies or [])]))
+        options.encoder = options.encoder or configuration["encoder"].partition("@")[0]
+        for name in ("instances", "start_seed", "repeats", "repeat_every", "action_noise", "split"):
+            setattr(options, name, configuration[name])
+    except KeyError as missing:
+        raise DataError(
+            f"{options.out / 'run.json'}: not of a recording by this version, it has no {missing}; give all flags it was made with"
+        ) from None
 
 
 def _as_it_began(configuration: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
