@@ -9,7 +9,7 @@ ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1
 
 SHORT := open_drawer close_drawer press_button door pick_place lift stack push nut_assembly
-POLICIES := local_small remote_specialist remote_large
+POLICIES := local_small remote_specialist remote_base remote_large
 
 .PHONY: run test slow lint bench policies wheel requirements environment clean
 
@@ -39,7 +39,7 @@ policies: $(READY)
 		$(PYTHON) -m osel_sim.train --policy $$policy --data data/suite --out runs/train/$$policy --half --resume $(ARGS) && \
 		mkdir -p assets/policies/$$policy && cp runs/train/$$policy/*.json runs/train/$$policy/*.safetensors assets/policies/$$policy/ || exit 1; \
 	done
-	$(PYTHON) -m osel_sim.record --task all --level 0 2 --policies $(POLICIES) --instances 50 --repeats 3 --repeat-every 10 --out runs/suite $$([ ! -f runs/suite/run.json ] || echo --resume)
+	$(PYTHON) -m osel_sim.record --task all --level 0 2 --policies $(POLICIES) --instances 50 --repeats 3 --repeat-every 10 --action-noise 0.05 --out runs/suite $$([ ! -f runs/suite/run.json ] || echo --resume)
 
 wheel: $(READY)
 	$(PYTHON) -m build --no-isolation

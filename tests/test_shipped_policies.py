@@ -13,12 +13,13 @@ from osel_sim.policy.registry import make_policy
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.instance import make_instance
 
-POLICIES = ("local_small", "remote_large", "remote_specialist")
+POLICIES = ("local_small", "remote_base", "remote_large", "remote_specialist")
 INSTANCES = 12
 
 
 @pytest.mark.parametrize(
-    ("name", "task", "at_least"), [("local_small", "pick_place", 3), ("remote_large", "pick_place", 8), ("remote_specialist", "open_drawer", 8)]
+    ("name", "task", "at_least"),
+    [("local_small", "pick_place", 3), ("remote_base", "pick_place", 7), ("remote_large", "pick_place", 8), ("remote_specialist", "open_drawer", 8)],
 )
 def test_solves_unseen_instances(name, task, at_least):
     env = TaskEnv(task)

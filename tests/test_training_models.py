@@ -188,7 +188,8 @@ def test_recipes_of_all_types_and_what_they_refuse(tmp_path: Path) -> None:
     for name, kind in {
         "local_small": "language_chunk",
         "remote_large": "octo_chunk",
-        "remote_base": "act",
+        "remote_base": "language_chunk",
+        "act": "act",
         "remote_specialist": "language_chunk",
     }.items():
         assert load_recipe(find_recipe(name)).type == kind
