@@ -71,6 +71,7 @@ def _record(options: argparse.Namespace) -> int:
     from osel_sim.runtime.workers import Plan
     from osel_sim.sim.gl import choose_backend
 
+    added_encoder = options.encoder is not None  # one given is added; the encoder that was there must not have changed
     if options.resume and not options.task and options.out is not None:
         check_folder(options.out, {}, resume=True)
         _take_settings(options, read_json(options.out / RUN).get("configuration", {}))
@@ -113,8 +114,9 @@ def _record(options: argparse.Namespace) -> int:
     check_folder(folder, known, options.resume)
     encoder = load_encoder(encoder_name)
     configuration["encoder"] = encoder.identity
+    known["encoder"] = before.get("configuration", {}).get("encoder") if before and added_encoder else encoder.identity
     ran_with = environment(choose_backend(), content.root())
-    for warning in start_or_resume(folder, known if before else configuration, ran_with, options.resume):
+    for warning in start_or_resume(folder, known, ran_with, options.resume):
         print(f"warning: {warning}", file=sys.stderr)
     recording = Recording(folder, plan, encoder.identity)
     if recording.complete:
@@ -150,12 +152,12 @@ def _take_settings(options: argparse.Namespace, configuration: dict[str, Any]) -
 
 
 def _as_it_began(configuration: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """The configuration as it would have been without what a recording may be given later on: more policies, and contexts of another encoder.
+    """The configuration as it would have been without the policies that a recording is given later on.
 
     Args:
         before: what the recording began with.
     """
-    known = configuration | {"encoder": before.get("encoder")}
+    known = dict(configuration)
     policies, content_then = before.get("policies", []), before.get("content", {})
     added = set(configuration["policies"]) - set(policies)
     if added and set(policies) < set(configuration["policies"]):

@@ -138,6 +138,29 @@ def test_a_policy_that_cannot_be_added_leaves_the_log_as_it_was(world, reference
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
 
+def test_an_encoder_that_changed_is_refused_unless_it_is_asked_for(world, reference, capsys):
+    folder = world / "old_encoder"
+    shutil.copytree(reference[0], folder)
+    run = json.loads((folder / "run.json").read_text())
+    run["configuration"]["encoder"] = "colours@before"
+    (folder / "run.json").write_text(json.dumps(run))
+    places = ["--tasks", str(world / "tasks"), "--policies-dir", str(world / "policies")]
+    assert record.main(["--resume", "--out", str(folder), *places]) == 2
+    assert "encoder was 'colours@before' at the beginning, now it is 'colours'" in capsys.readouterr().err
+    assert record.main(["--resume", "--out", str(folder), *places, "--encoder", "colours"]) == 0
+
+
+@pytest.mark.parametrize(("noise", "lengths"), [(0.0, {1}), (0.1, {2, 3})])
+def test_repeats_differ_by_noise_on_actions_alone(tmp_path, noise, lengths):
+    folder = tmp_path / "log"
+    what = ["--task", "close_drawer", "--policies", "scripted_expert", "--instances", "2", "--repeats", "3"]
+    assert record.main([*what, "--action-noise", str(noise), "--workers", "1", "--out", str(folder)]) == 0
+    steps: dict[str, set[int]] = {}
+    for row in read_rollouts(folder)[0]:
+        steps.setdefault(row.instance, set()).add(row.steps)
+    assert {len(different) for different in steps.values()} <= lengths
+
+
 def test_a_dying_worker_costs_one_episode(world, reference):
     """The local policy takes its worker along in one of the instances; everything else is as it would have been."""
     whole, _ = read_rollouts(reference[0])

@@ -108,6 +108,16 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
     assert bytes_of(folder) == bytes_of(reference[0])
 
 
+def test_noise_on_actions_reaches_the_robot(tmp_path):
+    lengths = []
+    for noise in ("0", "0.1"):
+        folder = tmp_path / noise
+        what = ["--task", "close_drawer", "--policies", "scripted_expert", "--selector", "random", "--episodes", "3"]
+        assert run.main([*what, "--action-noise", noise, "--out", str(folder)]) == 0
+        lengths.append([decision.steps for decision in read_journal(folder / "episodes.jsonl")])
+    assert lengths[0] != lengths[1]
+
+
 def test_ctrl_c_ends_with_what_there_is(world):
     folder = world / "interrupted"
     arguments = command(world, "run", "--episodes", 500, "--out", folder, "--selector", "random")

@@ -61,16 +61,14 @@ class Recording:
         Args:
             configuration: goes into the log's metadata.
         """
-        if self._shards is not None:
-            for encoder, contexts in self._shards.contexts.items():
-                for instance in self.plan.instances:
-                    if instance in contexts:
-                        self._cache.put(encoder, instance, contexts[instance])
-            self._cache.save()
+        shards = self._shards or Shards(self.folder)
+        for encoder, contexts in shards.contexts.items():
+            for instance, context in contexts.items():
+                self._cache.put(encoder, instance, context)
+        self._cache.save()
         write_rollouts(self.folder, [self._rows[key][episode] for key in self.plan.instances for episode in self.plan.episodes(key)], configuration)
-        if self._shards is not None:
-            self._shards.close(remove=True)
-            self._shards = None
+        shards.close(remove=True)
+        self._shards = None
 
     def _has_context(self, instance: str) -> bool:
         in_shards = self._shards is not None and instance in self._shards.contexts.get(self.encoder, {})

@@ -146,6 +146,7 @@ class _Supervisor(threading.Thread):
                 for episode in missing:
                     recorded.rows[episode] = pipe.recv()
                     self._results.put(None)
+                break
             except (EOFError, OSError):
                 if self._stopped:
                     return
@@ -155,9 +156,8 @@ class _Supervisor(threading.Thread):
                     policy, repeat = missing.pop(0)
                     recorded.rows[policy, repeat] = error_row(self._plan, instance, policy, repeat, f"the worker process died ({died})")
                     self._results.put(None)
-                if missing:
-                    continue
-            break
+                if not missing:
+                    break
         self._results.put(recorded)
 
     def _hire(self) -> Connection:
