@@ -11,6 +11,7 @@ from osel_sim.errors import UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.formats.replay_result import Choices
+    from osel_sim.offline.engine import Beforehand
     from osel_sim.offline.live import LiveLog
     from osel_sim.offline.log import LoggedOutcomes
     from osel_sim.selection.reward import RewardWeights
@@ -21,12 +22,14 @@ COSTS = "expected_costs"
 EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/pick_place                                   # every selector there is, 20 seeds
   python -m osel_sim.replay assets/logs/pick_place --selectors ppo ucb1 --preset waymo --out runs/ppo
+  python -m osel_sim.replay assets/logs/suite --half score --selectors auto auto:warm   # without and with the outcomes of the other half beforehand
   python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500
   python -m osel_sim.replay runs/pick_place-ppo-s0                                   # a live run: off-policy estimates from its propensities
 
 Shows the log's instances in random orders without replacement to every selector, which sees only the outcome of its choice, and says how far each
 stays from the oracles and whether routing is worth it. Fixed policies, the best and the worst of them, and the oracles are always included.
 Instances on which some policy has no valid outcome are left out and counted. The result does not depend on --workers.
+With --half a selector that learns off-policy can be shown all outcomes of the other half before its stream begins: auto:warm, linucb:warm ...
 
 Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv. Of a live run's folder it estimates what each
 fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes."""
@@ -40,7 +43,7 @@ def main(arguments: list[str] | None = None) -> int:
     from osel_sim.offline.live import is_live_run, read_live
     from osel_sim.offline.log import read_log
 
-    selectors = choose_selectors(options.selectors)
+    selectors = choose_selectors(options.selectors, halved=options.half is not None)
     folder: Path = options.out or Path("runs") / f"replay-{options.log.resolve().name}"
     check_folder(folder, options.overwrite)
     if not is_live_run(options.log):
@@ -91,6 +94,7 @@ def _replay(
 ) -> None:
     """Replay, write and print."""
     from osel_sim.formats.replay_result import write_replay
+    from osel_sim.offline.engine import Beforehand
     from osel_sim.offline.oracles import oracles
     from osel_sim.offline.result import build, tables, with_fixed
     from osel_sim.offline.streams import complete_instances
@@ -107,7 +111,7 @@ def _replay(
     if left_out.instances:
         print(f"warning: {left_out.instances} instances without an outcome of every policy are left out", file=sys.stderr)
     best = oracles(log, weights)
-    choices = with_fixed(_replay_all(log, weights, selectors, costs, options), best)
+    choices = with_fixed(_replay_all(log, weights, selectors, costs, options, Beforehand(others.contexts, others.rewards(weights))), best)
     result = build(log, weights, preset, choices, best, left_out, range(options.seeds))
     result["log"]["half"] = options.half
     result["off_policy"] = off_policy
@@ -137,12 +141,18 @@ def _write_off_policy(folder: Path, found: dict[str, Any]) -> None:
 
 
 def _replay_all(
-    log: "LoggedOutcomes", weights: "RewardWeights", selectors: Sequence[str], costs: "dict[str, float] | None", options: argparse.Namespace
+    log: "LoggedOutcomes",
+    weights: "RewardWeights",
+    selectors: Sequence[str],
+    costs: "dict[str, float] | None",
+    options: argparse.Namespace,
+    beforehand: "Beforehand",
 ) -> "Choices":
     """Run the replays, with a progress bar.
 
     Args:
         costs: of each policy, for those selectors that want to know them beforehand; None: for none.
+        beforehand: shown to selectors named `NAME:warm`.
     """
     from tqdm import tqdm  # type: ignore[import-untyped]
 
@@ -154,18 +164,22 @@ def _replay_all(
     )
     decisions = len(log) if options.decisions is None else options.decisions
     with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
-        return replay(log, weights, selectors, range(options.seeds), options.decisions, options.workers, told, bar.update)
+        return replay(log, weights, selectors, range(options.seeds), options.decisions, options.workers, told, bar.update, beforehand)
 
 
-def choose_selectors(names: Sequence[str] | None) -> list[str]:
+def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[str]:
     """Names of selectors to replay: those given, each once, else all that are installed. Fixed policies are left out: they are always added.
+
+    Args:
+        halved: whether there is another half of the log, whose outcomes a selector named `NAME:warm` is shown.
 
     Raises:
         UnknownNameError: no such selector.
-        UsageError: it needs a package that is not installed.
+        UsageError: it needs a package that is not installed, or cannot start warm.
     """
+    from osel_sim.offline.engine import WARM
     from osel_sim.offline.result import REFERENCES
-    from osel_sim.selection.registry import selector_locations
+    from osel_sim.selection.registry import learns_off_policy, selector_locations
     from osel_sim.selection.vowpal import available
 
     locations = selector_locations()
@@ -173,12 +187,21 @@ def choose_selectors(names: Sequence[str] | None) -> list[str]:
         # `auto` is another name of one of them, which need not run twice.
         twins = {name for name, place in locations.items() if place == locations.get("auto") and name != "auto"}
         names = sorted(name for name in locations if name not in twins and (available() or not name.startswith("vw_")))
+        names += [f"auto{WARM}"] if halved else []
     for name in names:
         kind = name.partition(":")[0]
         if kind not in locations and name not in REFERENCES:
             raise UnknownNameError("selector", name, {*locations, *REFERENCES} - {"fixed"})
         if name.startswith("vw_") and not available():
             raise UsageError(f"selector {name!r} needs the package vowpalwabbit: pip install 'osel-sim[vw]'")
+        if name.endswith(WARM) and kind != "fixed":
+            if not halved:
+                raise UsageError(f"selector {name!r} is shown the outcomes of the log's other half beforehand: say which half to replay with --half")
+            if not learns_off_policy(kind):
+                able = [known for known in locations if known != "kernel_ucb" and learns_off_policy(known)]
+                raise UsageError(
+                    f"selector {kind!r} learns only from what it chose itself, so it cannot start warm; those that can: {', '.join(able)}"
+                )
     return [name for name in dict.fromkeys(names) if name.partition(":")[0] != "fixed" and name not in REFERENCES]
 
 

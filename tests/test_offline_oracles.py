@@ -26,7 +26,8 @@ def test_order_and_truth(tmp_path: Path):
     assert hindsight > made.oracle + 0.1
     assert made.best_single + 0.05 < found.expected.mean() < made.oracle + 0.02
     assert found.predictable.mean() == pytest.approx(made.oracle, abs=0.02)
-    assert found.grouping == {"score": ("target",), "choose": ("target",)}
+    assert found.grouping == {"first": ("target",), "second": ("target",)}
+    assert oracles(log.take(log.half("score")), FREE).predictable.mean() == pytest.approx(made.oracle, abs=0.03)
     assert log.mean_rewards(FREE)[:, found.best_single].mean() == pytest.approx(made.best_single, abs=0.02)
 
 

@@ -60,6 +60,9 @@ def test_result(replayed, log):
     best = result["selectors"]["linucb"]
     assert best["learnable_gap_closed"] == pytest.approx(gap)
     assert best["learnable_gap_closed_late"] > best["learnable_gap_closed"] > 0.4
+    assert (
+        best["predictable_gap_closed"] == best["learnable_gap_closed"]
+    )  # there are no repeats, so the predictable oracle bounds what can be learned
     assert best["regret"]["hindsight"] == pytest.approx(oracles["hindsight"] - means["linucb"])
     assert 0 < best["decisions_until_better"] < best["decisions_until_ahead"] < 300
     assert result["selectors"]["thompson"]["decisions_until_ahead"] is None
@@ -110,6 +113,16 @@ def test_repeats_missing_outcomes_and_the_half(tmp_path: Path, log):
     assert 250 < result["log"]["instances"] < 350 and choices.order.shape == (2, 50)
 
 
+def test_a_warm_start_spares_the_beginning(tmp_path: Path, log):
+    assert run(log, "--half", "score", "--selectors", "linucb", "linucb:warm", "--seeds", 3, "--out", tmp_path / "out", *FREE) == 0
+    result, choices = read_replay(tmp_path / "out")
+    begun = read_log(log)
+    begun = begun.take([begun.keys.index(key) for key in choices.instances])
+    first = {name: choices.received(name, begun.rewards(RewardWeights(0.0, 0.0)))[:, :100].mean() for name in ("linucb", "linucb:warm")}
+    assert first["linucb:warm"] > first["linucb"] + 0.05
+    assert result["selectors"]["linucb:warm"]["kind"] == "learner" and result["selectors"]["linucb:warm"]["decisions_until_ahead"] < 30
+
+
 @pytest.mark.slow
 def test_workers_do_not_matter(log):
     names = ["ppo_tuned", "linucb", "epsilon_greedy"]
@@ -135,6 +148,9 @@ def test_a_selector_sees_the_outcomes_of_its_choices_only(log, monkeypatch):
     [
         (["--selectors", "pppo"], "unknown selector 'pppo': did you mean 'ppo'?"),
         (["--policies", "policy_9"], "unknown policy 'policy_9'"),
+        (["--selectors", "linucb:warm"], "say which half to replay with --half"),
+        (["--selectors", "ppo:warm", "--half", "score"], "cannot start warm; those that can: auto, "),
+        (["--selectors", "linubc:warm", "--half", "score"], "did you mean 'linucb'?"),
         (["--preset", "mmul"], "unknown reward preset 'mmul': did you mean 'mmlu'?"),
         (["--decisions", "601"], "--decisions 601: the log has 600 instances"),
         (["--encoder", "clip"], "no contexts of encoder 'clip'"),

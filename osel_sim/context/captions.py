@@ -37,10 +37,11 @@ COUNTINGS = ("{} on the table", "there are {}", "a table with {}", "{}")
 
 @dataclass(frozen=True)
 class Caption:
-    """A sentence and the facts (indices) it claims."""
+    """A sentence, the facts (indices) it claims, and whether it is an instruction."""
 
     text: str
     claims: tuple[int, ...]
+    is_instruction: bool = False
 
 
 class Captions:
@@ -77,7 +78,7 @@ class Captions:
         """An instruction; it claims that what fills its roles (role -> entity) is in view. Roles that are properties claim nothing."""
         names = {role: self._name(entity, rng) for role, entity in roles.items()}
         properties = {role: _pick(self.task.attributes[_pick(list(self.task.attributes), rng)], rng) for role in self._properties}
-        return Caption(template.format(**names, **properties), tuple(roles.values()))
+        return Caption(template.format(**names, **properties), tuple(roles.values()), is_instruction=True)
 
     def draw(self, facts: NDArray[np.int8], count: int, rng: np.random.Generator, words: Sequence[str]) -> list[Caption]:
         """Captions for a batch of views with `facts` (N, F); about half the things they speak of are taken from what is in some view.

@@ -39,6 +39,7 @@ class Batch:
         task: name of the task.
         images: float32 (B, 3, S, S), normalised.
         texts: M captions.
+        instructions: bool (M,), which captions are instructions.
         truth: int8 (B, M), 1 true, -1 false, 0 cannot be told.
         pixels: float32 (B, E, 2), where each entity is, as fractions of the view; NaN where it is not in it.
     """
@@ -46,6 +47,7 @@ class Batch:
     task: str
     images: Any
     texts: list[str]
+    instructions: NDArray[np.bool_]
     truth: NDArray[np.int8]
     pixels: NDArray[np.float32]
 
@@ -92,28 +94,31 @@ def make_batch(scenes: Scenes, captions: Captions, views: int, texts: int, rng: 
     grid = functional.affine_grid(theta, [views, 3, IMAGE_SIZE, IMAGE_SIZE], align_corners=False)
     images = functional.grid_sample(images, grid, padding_mode="border", align_corners=False)
     pixels[facts[:, : pixels.shape[1]] != 1] = np.nan
-    return Batch(captions.task.name, images, [caption.text for caption in drawn], truth(facts, drawn), pixels)
+    instructions = np.array([caption.is_instruction for caption in drawn], bool)
+    return Batch(captions.task.name, images, [caption.text for caption in drawn], instructions, truth(facts, drawn), pixels)
 
 
 class Objective:
-    """What is minimised: the pairwise sigmoid loss, and two linear readouts that are thrown away after training.
+    """What is minimised: the pairwise sigmoid loss, and linear readouts that are thrown away after training.
 
     Pairs teach quickly what is there, and slowly where; a readout of where things are speeds that up. Captions that claim the same should embed
-    alike, but a selector may want to know how something was said; a readout of the words used keeps that in the text embedding.
+    alike, but a selector may want to know how something was said; a readout of the words used keeps that in the text embedding. Pairs say nothing
+    of what is to be done with the things named; where there are several tasks, a readout of an instruction's task does.
 
     Args:
         entities: task -> how many things can be in its scenes.
     """
 
-    where_weight, wording_weight = 1.0, 0.05
+    where_weight, wording_weight, task_weight = 1.0, 0.05, 0.2
 
     def __init__(self, model: Any, entities: Mapping[str, int]) -> None:
         import torch
 
-        self.model = model
+        self.model, self._tasks = model, list(entities)
         width = model.text_projection.shape[1]
         where = {f"where_{task}": torch.nn.Linear(width, 2 * count) for task, count in entities.items()}
-        self.readouts = torch.nn.ModuleDict({**where, "wording": torch.nn.Linear(width, model.vocab_size)})
+        told = {"task": torch.nn.Linear(width, len(entities))} if len(entities) > 1 else {}
+        self.readouts = torch.nn.ModuleDict({**where, "wording": torch.nn.Linear(width, model.vocab_size), **told})
         self.readouts.to(model.logit_scale.device)
 
     def __call__(self, batch: Batch, tokens: Any) -> Any:
@@ -126,7 +131,8 @@ class Objective:
         texts = model.encode_text(tokens, normalize=True).float()
         pairwise = self._pairwise(images, texts, torch.from_numpy(batch.truth).float().to(device))
         where = self._where(batch.task, images, torch.from_numpy(batch.pixels).to(device))
-        return pairwise + self.where_weight * where + self.wording_weight * self._wording(texts, tokens)
+        told = self._task(batch.task, texts[torch.from_numpy(batch.instructions).to(device)])
+        return pairwise + self.where_weight * where + self.wording_weight * self._wording(texts, tokens) + self.task_weight * told
 
     def _pairwise(self, images: Any, texts: Any, truths: Any) -> Any:
         """Sigmoid loss over the pairs that can be told (SigLIP, arXiv:2303.15343), true and false ones weighing the same."""
@@ -148,3 +154,12 @@ class Objective:
         said = functional.log_softmax(self.readouts["wording"](10 * texts), dim=1).gather(1, tokens)
         word = (tokens > 0) & (tokens < self.model.vocab_size - 2)
         return -((said * word).sum(dim=1) / word.sum(dim=1).clamp(min=1)).mean()
+
+    def _task(self, task: str, texts: Any) -> Any:
+        """Cross entropy of the task, from instructions; 0 where there is one task only."""
+        import torch.nn.functional as functional
+
+        if "task" not in self.readouts or not len(texts):
+            return texts.new_zeros(())
+        said = functional.log_softmax(self.readouts["task"](10 * texts), dim=1)
+        return -said[:, self._tasks.index(task)].mean()

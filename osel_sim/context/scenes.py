@@ -1,6 +1,6 @@
 """Pictures of a task's instances with what is where on them: what the embedded encoder learns from and is measured on."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -60,8 +60,8 @@ class Scenes:
             raise DataError(f"{file}: not a file of scenes ({' '.join(str(error).split())}); remove it to render them again") from None
 
 
-def render_scenes(task: TaskSpec, seeds: Iterable[int], split: str, size: int, level: int = 0) -> Scenes:
-    """Load each instance into the simulator and take its picture."""
+def render_scenes(task: TaskSpec, seeds: Iterable[int], split: str, size: int, levels: Sequence[int] = (0,)) -> Scenes:
+    """Load each instance into the simulator and take its picture; seeds go through `levels` in turn."""
     from rich.progress import track
 
     from osel_sim.sim.env import TaskEnv
@@ -72,7 +72,7 @@ def render_scenes(task: TaskSpec, seeds: Iterable[int], split: str, size: int, l
     rows: dict[str, list[Any]] = {field.name: [] for field in fields(Scenes)}
     try:
         for seed in track(list(seeds), f"rendering {split} scenes"):
-            instance = make_instance(task, seed, level, split)
+            instance = make_instance(task, seed, levels[seed % len(levels)], split)
             env.load(instance)
             pixels, positions = (np.full((len(order), 2), np.nan, np.float32) for _ in range(2))
             for name, place in env.entity_positions().items():
@@ -91,9 +91,10 @@ def render_scenes(task: TaskSpec, seeds: Iterable[int], split: str, size: int, l
     return Scenes(**{name: np.array(values) for name, values in rows.items()})
 
 
-def cached_scenes(folder: Path, task: TaskSpec, count: int, split: str, size: int) -> Scenes:
+def cached_scenes(folder: Path, task: TaskSpec, count: int, split: str, size: int, levels: Sequence[int] = (0,)) -> Scenes:
     """The first `count` instances of a split, from `folder` or rendered and kept there."""
-    file = folder / f"scenes_{task.name}_{split}_{count}_{size}px.npz"
+    turned_up = "" if tuple(levels) == (0,) else "_level" + "".join(map(str, levels))
+    file = folder / f"scenes_{task.name}_{split}_{count}_{size}px{turned_up}.npz"
     if not file.is_file():
-        render_scenes(task, range(count), split, size).save(file)
+        render_scenes(task, range(count), split, size, levels).save(file)
     return Scenes.load(file)

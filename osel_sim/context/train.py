@@ -12,13 +12,14 @@ from osel_sim import cli
 from osel_sim.content import select_tasks
 from osel_sim.context.encoder import DEFAULT_ENCODER, WEIGHTS
 from osel_sim.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.formats.levels import LEVELS
 
 STATE = "training_state.pt"
 REPORT = "training.json"
 SAVE_SECONDS = 60.0
 EXAMPLES = """examples:
   python -m osel_sim.train --encoder osel_small --data data/scenes
-  python -m osel_sim.train --encoder osel_small --data data/scenes --task all --steps 3000 --out runs/train/osel_small
+  python -m osel_sim.train --encoder osel_small --data data/scenes --task all --level 0 1 2 --steps 3000 --out runs/train/osel_small
 """
 
 
@@ -28,6 +29,7 @@ class Settings:
 
     Attributes:
         tasks: whose scenes are seen; with several, steps take turns.
+        levels: of the scenes, in turn.
         steps: gradient steps; the learning rate falls to zero over them.
         scenes, test_scenes: how many instances of each task's train and test split are rendered.
         views, texts: views and captions a batch.
@@ -35,6 +37,7 @@ class Settings:
     """
 
     tasks: tuple[str, ...] = ("pick_place",)
+    levels: tuple[int, ...] = (0,)
     steps: int = 1600
     seed: int = 0
     scenes: int = 8_000
@@ -54,6 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="rendered scenes are kept here, and rendered if missing")
     parser.add_argument("--out", type=Path, metavar="DIR", help="the checkpoint's folder (default: DATA/<encoder>); load it with --encoder DIR")
     parser.add_argument("--task", nargs="+", default=list(defaults.tasks), help="names, tag:TAG, or all (default: pick_place)")
+    parser.add_argument("--level", nargs="+", type=int, choices=LEVELS, default=[0], help="levels of the scenes, in turn (default: 0)")
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--steps", type=int, default=defaults.steps, help="gradient steps (default: %(default)s)")
     length.add_argument("--minutes", type=float, help="as many steps as fit, timed on the first ones")
@@ -71,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.minutes is not None and not options.minutes > 0:
         raise UsageError(f"--minutes must be more than 0, got {options.minutes}")
     tasks = tuple(task.name for task in select_tasks(options.task))
-    settings = Settings(tasks, options.steps, options.seed, options.scenes, options.test_scenes)
+    settings = Settings(tasks, tuple(options.level), options.steps, options.seed, options.scenes, options.test_scenes)
     report = train(settings, options.data, options.out or options.data / options.encoder, options.minutes, options.device, options.resume)
     print(json.dumps(report["measured"], indent=2))
     return 0
@@ -98,8 +102,8 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
     if not resume and (out / WEIGHTS).exists():
         raise UsageError(f"{out} holds a checkpoint already; pass --resume to go on with it, or another --out")
     tasks = select_tasks(settings.tasks)
-    scenes = [cached_scenes(data, task, settings.scenes, "train", recipe.IMAGE_SIZE) for task in tasks]
-    test = [cached_scenes(data, task, settings.test_scenes, "test", recipe.IMAGE_SIZE) for task in tasks]
+    scenes = [cached_scenes(data, task, settings.scenes, "train", recipe.IMAGE_SIZE, settings.levels) for task in tasks]
+    test = [cached_scenes(data, task, settings.test_scenes, "test", recipe.IMAGE_SIZE, settings.levels) for task in tasks]
     recipe.write_architecture(out)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
     torch.manual_seed(settings.seed)

@@ -17,10 +17,25 @@ from osel_sim.errors import OselError
 from osel_sim.formats.replay_result import Choices
 from osel_sim.offline.log import LoggedOutcomes
 from osel_sim.offline.streams import Streams, draw_streams
+from osel_sim.selection.protocol import Choice, Selector
 from osel_sim.selection.reward import RewardWeights
 
-SLOW_FIRST = ("ppo", "auto", "neural_linear", "ppo_tuned", "vw_regcb", "vw_squarecb")
+WARM = ":warm"
+"""Ending of the name of a selector that is shown all outcomes of other instances before its stream begins."""
+
+_WARM_SALT = 0x3A2E
+"""Keeps the order of what is shown beforehand apart from other random numbers of the same seed."""
+
+SLOW_FIRST = ("ppo", "auto:warm", "auto", "neural_linear", "ppo_tuned", "vw_regcb", "vw_squarecb")
 """Selectors whose replays take longest are begun first, so that no worker is left with a long one at the end."""
+
+
+@dataclass(frozen=True)
+class Beforehand:
+    """Outcomes that a selector is shown before its stream: contexts float32 (M, D) of other instances, rewards (M, P, R), NaN where there is none."""
+
+    contexts: NDArray[np.float32]
+    rewards: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -33,6 +48,7 @@ class _Material:
     seeds: tuple[int, ...]
     policies: tuple[str, ...]
     settings: dict[str, dict[str, Any]]
+    beforehand: Beforehand | None
 
 
 def replay(
@@ -44,21 +60,23 @@ def replay(
     workers: int = 1,
     settings: dict[str, dict[str, Any]] | None = None,
     progress: Callable[[int], Any] | None = None,
+    beforehand: Beforehand | None = None,
 ) -> Choices:
     """Show the streams of all seeds to every selector.
 
     Args:
         log: complete instances only (`osel_sim.offline.streams.complete_instances`).
-        selectors: names, as `osel_sim.selection.registry.make_selector` takes them.
+        selectors: names, as `osel_sim.selection.registry.make_selector` takes them; `NAME:warm` for one that is shown what is known `beforehand`.
         seeds: of the streams, and of the selectors.
         decisions: length of a stream; None: all instances.
         workers: processes; with 1 it happens in this one.
         settings: selector -> keyword arguments, where they are not to be the defaults.
         progress: called with a number of decisions made.
+        beforehand: of other instances than the log's; needed for selectors named `NAME:warm`.
     """
     table = log.rewards(weights)
     streams = draw_streams(table, seeds, decisions)
-    material = _Material(log.contexts, table, streams, tuple(seeds), log.policies, settings or {})
+    material = _Material(log.contexts, table, streams, tuple(seeds), log.policies, settings or {}, beforehand)
     jobs = [(name, number) for name in sorted(selectors, key=_slowness) for number in range(len(seeds))]
     chosen = {name: np.zeros(streams.order.shape, np.int8) for name in selectors}
     for name, number, columns in _run(material, jobs, workers):
@@ -69,12 +87,19 @@ def replay(
 
 
 def replay_one(
-    name: str, contexts: NDArray[np.float32], rewards: NDArray[np.float64], policies: Sequence[str], seed: int, **settings: Any
+    name: str,
+    contexts: NDArray[np.float32],
+    rewards: NDArray[np.float64],
+    policies: Sequence[str],
+    seed: int,
+    beforehand: Beforehand | None = None,
+    **settings: Any,
 ) -> NDArray[np.int8]:
     """Show one stream to one selector, which sees the reward of its choices only.
 
     Args:
         contexts: (T, D). rewards: (T, P).
+        beforehand: shown first, in an order of the seed's.
         settings: of the selector.
 
     Returns:
@@ -85,6 +110,8 @@ def replay_one(
     from osel_sim.selection.registry import make_selector
 
     selector = make_selector(name, policies, contexts.shape[1], seed, **settings)
+    if beforehand is not None:
+        _show(selector, beforehand, policies, seed)
     if isinstance(selector, PPOSelector) and supports(selector):
         return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
     column = {policy: index for index, policy in enumerate(policies)}
@@ -94,6 +121,14 @@ def replay_one(
         chosen[decision] = column[choice.policy]
         selector.update(context, choice, float(rewards[decision, chosen[decision]]))
     return chosen
+
+
+def _show(selector: Selector, beforehand: Beforehand, policies: Sequence[str], seed: int) -> None:
+    """Let a selector learn from every outcome, as if each had been chosen by chance."""
+    chances = {policy: 1.0 / len(policies) for policy in policies}
+    known = np.argwhere(np.isfinite(beforehand.rewards))
+    for row, column, repeat in np.random.default_rng([_WARM_SALT, seed]).permutation(known):
+        selector.update(beforehand.contexts[row], Choice(policies[column], chances), float(beforehand.rewards[row, column, repeat]))
 
 
 def _slowness(name: str) -> int:
@@ -144,7 +179,8 @@ def _job(material: _Material, name: str, number: int) -> tuple[str, int, NDArray
     rewards = streams.rewards(material.rewards, number)
     contexts = material.contexts[streams.order[number]]
     contexts.flags.writeable = False
-    return name, number, replay_one(name, contexts, rewards, material.policies, material.seeds[number], **material.settings.get(name, {}))
+    kind, shown = name.removesuffix(WARM), material.beforehand if name.endswith(WARM) else None
+    return name, number, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, **material.settings.get(name, {}))
 
 
 def _limit_threads() -> Any:

@@ -76,8 +76,10 @@ def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -
         "mean_price": got["price"],
         "shares": {policy: float((chosen == column).mean()) for column, policy in enumerate(choices.policies)},
         "shares_late": {policy: float((chosen[:, late] == column).mean()) for column, policy in enumerate(choices.policies)},
-        **_gap_entries("learnable_gap_closed", gap_closed(received, rewards, 0)),
-        **_gap_entries("learnable_gap_closed_late", gap_closed(received, rewards, rewards.late)),
+        **_gap_entries("learnable_gap_closed", gap_closed(received, rewards, rewards.learnable, 0)),
+        **_gap_entries("learnable_gap_closed_late", gap_closed(received, rewards, rewards.learnable, rewards.late)),
+        **_gap_entries("predictable_gap_closed", gap_closed(received, rewards, "predictable", 0)),
+        **_gap_entries("predictable_gap_closed_late", gap_closed(received, rewards, "predictable", rewards.late)),
         "regret": {oracle: float((values - received).mean()) for oracle, values in rewards.oracles.items()},
         "regret_ci95": {oracle: list(bootstrap_mean_interval((values - received).mean(axis=1))) for oracle, values in rewards.oracles.items()},
         "decisions_until_ahead": until_ahead(received - rewards.oracles["best_single"]),
@@ -85,15 +87,15 @@ def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -
     }
 
 
-def gap_closed(received: Array, rewards: Curves, first: int) -> tuple[float, Interval] | None:
-    """Share of the learnable gap closed from decision `first` on, with its 95 % bootstrap interval over seeds.
+def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tuple[float, Interval] | None:
+    """Share of the gap to an oracle closed from decision `first` on, with its 95 % bootstrap interval over seeds.
 
-    (selector - best single) / (learnable oracle - best single), all averaged over seeds and decisions. None where the learnable oracle is not better
-    than the best single policy, so that there is no gap to close.
+    (selector - best single) / (oracle - best single), all averaged over seeds and decisions. None where the oracle is not better than the best
+    single policy, so that there is no gap to close.
     """
     base = rewards.oracles["best_single"][:, first:].mean(axis=1)
     gains = received[:, first:].mean(axis=1) - base
-    gaps = rewards.oracles[rewards.learnable][:, first:].mean(axis=1) - base
+    gaps = rewards.oracles[oracle][:, first:].mean(axis=1) - base
     if gaps.mean() <= 0.0:
         return None
     generator = np.random.default_rng(0)

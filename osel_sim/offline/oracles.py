@@ -30,7 +30,7 @@ class Oracles:
         best_single, worst_single: columns of the policies with the highest and the lowest mean reward over all instances.
         expected: (N,) reward of the policy that was best on the same instance in other repeats, an estimate where it has none; None without repeats.
         predictable: (N,) reward of the policy that was best on *other* instances of the same group (by task, target, container, phrasing).
-        grouping: the attributes it went by, for each half of the instances it was scored on.
+        grouping: the attributes it went by, for each half of the instances (`first`, `second`) it was scored on.
         per_task: column of the policy with the highest mean reward on each instance's task, (N,).
     """
 
@@ -89,6 +89,7 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
     """Best policy of an instance's group, chosen on one half of the instances and scored on the other, both ways round.
 
     Which attributes make the groups is chosen on the choosing half as well (on one part of it, scored on the other): nothing scored had a say.
+    The halves are other ones than the log's own, so that a log of which only one of those is replayed still has both.
 
     Args:
         means: (N, P) mean rewards.
@@ -100,10 +101,9 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
     varying = [name for name in GROUPINGS if len(set(labels[name])) > 1]
     candidates = [names for size in range(len(varying) + 1) for names in combinations(varying, size)]
     groups = {names: _groups([labels[name] for name in names], len(log)) for names in candidates}
-    by_half = log.half("choose")
-    quarter = np.array([bool(hashlib.sha256(key.encode()).digest()[1] & 1) for key in log.keys], bool)
+    half, quarter = (np.array([bool(hashlib.sha256(key.encode()).digest()[byte] & 1) for key in log.keys], bool) for byte in (1, 2))
     value, used = np.full(len(log), np.nan), {}
-    for name, scored in (("score", ~by_half), ("choose", by_half)):
+    for name, scored in (("first", ~half), ("second", half)):
         choosing = ~scored
 
         def held_out(names: tuple[str, ...], choosing: NDArray[np.bool_] = choosing) -> float:

@@ -42,6 +42,13 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
             table.add_row(f"{name.replace('_', ' ')} oracle", _with_interval(entry["mean_reward"], entry["ci95"]))
     console.print(table)
     console.print(f"gap closed and regret: by the {learnable} oracle; ahead at: from that decision on the sum of rewards exceeds the best policy's")
+    learners = {name: entry for name, entry in result["selectors"].items() if entry["kind"] == "learner"}
+    if learnable != "predictable" and learners:
+        best = max(learners, key=lambda name: float(learners[name]["mean_reward"]))
+        whole, late = (
+            percent(learners[best][f"predictable_gap_closed{part}"], learners[best][f"predictable_gap_closed{part}_ci95"]) for part in ("", "_late")
+        )
+        console.print(f"of the gap to the predictable oracle {best} closed {whole}, in the last quarter {late}")
     if learnable == "predictable":
         console.print(
             "The log has no repeats, so there is no expected oracle: the gap is that of the predictable one (best policy by group, cross-fitted)."

@@ -29,6 +29,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
         names: selector -> what it is called on the page.
     """
     rows: list[dict[str, Cell]] = []
+    predictable = result["learnable_oracle"]["name"] == "predictable"
     shown = sorted(names, key=lambda name: -float(result["selectors"][name]["mean_reward"]))
     for name in shown:
         entry = result["selectors"][name]
@@ -41,6 +42,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
                 **{key: entry[key] for key in ("mean_seconds", "mean_price")},
                 "gap": gaps(entry)[0] if learns else None,
                 "gap_late": gaps(entry)[1] if learns else None,
+                "predictable_late": _estimate(entry, "predictable_gap_closed_late") if learns else None,
                 **{f"regret_{oracle}": _of(entry, "regret", oracle) for oracle in result["oracles"] if oracle in ORACLES},
                 "ahead": entry["decisions_until_ahead"] if learns else None,
             }
@@ -49,12 +51,15 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
         *(Column("selector", "selector", "text"), Column("reward", "mean reward", digits=3), Column("success", "success", "percent")),
         *(Column("mean_seconds", "seconds"), Column("mean_price", "price (cents)", digits=1)),
         *(Column("gap", "gap closed", "percent"), Column("gap_late", "last quarter", "percent")),
+        *([] if predictable else [Column("predictable_late", "of the predictable", "percent")]),
         *(Column(f"regret_{oracle}", f"regret to {word}", digits=3) for oracle, word in ORACLES.items() if oracle in result["oracles"]),
         Column("ahead", "ahead after"),
     ]
     caption = (
         "Means with 95% bootstrap intervals over seeds, the best first. Regret: reward a decision below the oracle. Gap closed: share of the way "
-        "from the best single policy to the learnable oracle. Ahead after: decisions until its rewards pass the best single policy's for good."
+        "from the best single policy to the learnable oracle"
+        + ("" if predictable else ", in the last quarter also to the predictable one")
+        + ". Ahead after: decisions until its rewards pass the best single policy's for good."
     )
     return Table("selectors", "What each selector came to", caption, columns, rows)
 

@@ -10,7 +10,7 @@ from osel_sim.offline.estimate import Estimate, mean_of, rate_of
 from osel_sim.offline.log import Array
 from osel_sim.reporting.description import Bars, Figure, Line, Mark, Panel, Points, colours, thinned
 
-MAIN = ("auto", "ppo", "ppo_tuned", "epsilon_greedy", "random")
+MAIN = ("auto:warm", "auto", "ppo", "ppo_tuned", "epsilon_greedy", "random")
 """Of many selectors, those drawn without being asked for: the recommended one, and those of the paper's figure 5."""
 
 ORACLES = {"hindsight": "hindsight oracle", "expected": "expected oracle", "predictable": "predictable oracle", "per_task": "per-task oracle"}

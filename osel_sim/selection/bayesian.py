@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -60,6 +60,8 @@ class BayesianSelector(SelectorBase):
         UsageError: a number out of range, or contexts of another form.
         UnknownNameError: `expected_costs` lacks a policy.
     """
+
+    off_policy: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -79,6 +79,8 @@ class SelectorBase(ABC):
     """
 
     name: ClassVar[str]
+    off_policy: ClassVar[bool] = False
+    """Whether it may learn from outcomes of choices that it did not make itself, such as those of a log."""
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int) -> None:
         self.policies = tuple(policies)

@@ -78,6 +78,18 @@ def setting_names(name: str) -> list[str]:
     return _settings(_factory(selector_locations()[kind]))
 
 
+def learns_off_policy(name: str) -> bool:
+    """Whether a selector may be shown outcomes of choices that it did not make (`SelectorBase.off_policy`).
+
+    Raises:
+        UnknownNameError: no such selector.
+    """
+    kind = name.partition(":")[0]
+    if kind not in selector_locations():
+        raise UnknownNameError("selector", name, selector_locations())
+    return bool(getattr(_factory(selector_locations()[kind]), "off_policy", False))
+
+
 def _factory(location: str) -> Any:
     module, _, attribute = location.partition(":")
     return getattr(import_module(module), attribute)

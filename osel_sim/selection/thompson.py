@@ -25,6 +25,7 @@ class ThompsonSelector(SelectorBase):
     """
 
     name: ClassVar[str] = "thompson"
+    off_policy: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int) -> None:
         super().__init__(policies, context_dim, seed)

@@ -23,6 +23,7 @@ class UCB1Selector(SelectorBase):
     """
 
     name: ClassVar[str] = "ucb1"
+    off_policy: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, *, width: float = 1.0) -> None:
         super().__init__(policies, context_dim, seed)
