@@ -11,7 +11,7 @@ from osel_sim.errors import UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.formats.replay_result import Choices
-    from osel_sim.offline.engine import Beforehand
+    from osel_sim.offline.beforehand import Beforehand
     from osel_sim.offline.live import LiveLog
     from osel_sim.offline.log import LoggedOutcomes
     from osel_sim.selection.reward import RewardWeights
@@ -94,7 +94,7 @@ def _replay(
 ) -> None:
     """Replay, write and print."""
     from osel_sim.formats.replay_result import write_replay
-    from osel_sim.offline.engine import Beforehand
+    from osel_sim.offline.beforehand import Beforehand
     from osel_sim.offline.oracles import oracles
     from osel_sim.offline.result import build, tables, with_fixed
     from osel_sim.offline.streams import complete_instances
@@ -177,9 +177,10 @@ def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[
         UnknownNameError: no such selector.
         UsageError: it needs a package that is not installed, or cannot start warm.
     """
+    from osel_sim.offline.beforehand import check_can_start_warm
     from osel_sim.offline.engine import WARM
     from osel_sim.offline.result import REFERENCES
-    from osel_sim.selection.registry import learns_off_policy, selector_locations
+    from osel_sim.selection.registry import selector_locations
     from osel_sim.selection.vowpal import available
 
     locations = selector_locations()
@@ -197,11 +198,7 @@ def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[
         if name.endswith(WARM) and kind != "fixed":
             if not halved:
                 raise UsageError(f"selector {name!r} is shown the outcomes of the log's other half beforehand: say which half to replay with --half")
-            if not learns_off_policy(kind):
-                able = [known for known in locations if known != "kernel_ucb" and learns_off_policy(known)]
-                raise UsageError(
-                    f"selector {kind!r} learns only from what it chose itself, so it cannot start warm; those that can: {', '.join(able)}"
-                )
+            check_can_start_warm(kind)
     return [name for name in dict.fromkeys(names) if name.partition(":")[0] != "fixed" and name not in REFERENCES]
 
 

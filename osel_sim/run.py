@@ -14,6 +14,7 @@ from osel_sim.errors import OselError, UnknownNameError
 if TYPE_CHECKING:
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.formats.task_file import TaskSpec
+    from osel_sim.offline.log import LoggedOutcomes
     from osel_sim.runtime.live import LiveRun
     from osel_sim.runtime.tensorboard import TensorBoard
     from osel_sim.selection.reward import RewardWeights
@@ -26,6 +27,7 @@ EXAMPLES = """examples:
   python -m osel_sim.run --list                                            # tasks and policies there are
   python -m osel_sim.run --task pick_place --episodes 60 --counterfactual  # PPO, compared with what could have been
   python -m osel_sim.run --task tag:short --level 0 2 --episodes 200       # several tasks and levels, mixed
+  python -m osel_sim.run --task all --level 0 2 --selector auto --warm-start assets/logs/suite   # it has seen the outcomes of a log
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first --resume
 
@@ -56,6 +58,7 @@ def parser() -> cli.Parser:
     add("--episodes", type=cli.positive_int, default=60, metavar="N", help="number of decisions (default: %(default)s)")
     add("--policies", nargs="+", metavar="NAME", help="policies to choose from (default: all there are)")
     add("--selector", default="ppo", metavar="NAME", help="ppo, epsilon_greedy, random, fixed:POLICY ... (default: %(default)s)")
+    add("--warm-start", type=cli.folder, metavar="LOG", help="rollout log whose outcomes the selector is shown first (auto, linucb, thompson ...)")
     add("--seed", type=cli.non_negative_int, default=0, help="of instances and selector (default: %(default)s)")
     add(
         "--level", type=cli.non_negative_int, nargs="+", default=[0], help="how hard scenes are perturbed, 0 to 3; several mix at random (default: 0)"
@@ -92,7 +95,7 @@ def _run(options: argparse.Namespace) -> int:
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
     weights = _weights(options)
-    _check_selector(options.selector, [spec.name for spec in policies])
+    _check_selector(options.selector, [spec.name for spec in policies], warm=options.warm_start is not None)
     folder = (
         options.out
         or Path("runs") / f"{'-'.join(name.replace(':', '-') for name in options.task)}-{options.selector.replace(':', '-')}-s{options.seed}"
@@ -109,6 +112,7 @@ def _run(options: argparse.Namespace) -> int:
 
     encoder = load_encoder(options.encoder or DEFAULT_ENCODER)
     configuration["encoder"] = encoder.identity
+    seen = _log(options.warm_start, encoder.identity, policies) if options.warm_start else None
     ran_with = environment(choose_backend(), content.root())
 
     import torch
@@ -121,7 +125,8 @@ def _run(options: argparse.Namespace) -> int:
 
     # The last bits of a matrix product depend on the number of threads; one, so that a run does not depend on how many there are.
     torch.set_num_threads(1)
-    selector = make_selector(options.selector, [spec.name for spec in policies], encoder.dimension, options.seed)
+    known = _declared_costs(options.selector, tasks, policies, weights)
+    selector = make_selector(options.selector, [spec.name for spec in policies], encoder.dimension, options.seed, **known)
     print(f"{_title(tasks)}: loading {', '.join(spec.name for spec in everyone)}, starting servers ...", file=sys.stderr)
     with contextlib.ExitStack() as stack:
         drivers = stack.enter_context(Drivers(everyone))
@@ -134,6 +139,8 @@ def _run(options: argparse.Namespace) -> int:
         )
         live = LiveRun(folder, tasks, envs, encoder, ContextCache(folder), drivers, selector, weights, live_options)
         stack.callback(live.close)
+        if seen is not None:
+            _start_warm(live, seen, options.episodes, options.seed)
         live.replay()
         board = None
         if options.tensorboard:
@@ -235,7 +242,36 @@ def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:
     }
 
 
-def _check_selector(name: str, policies: list[str]) -> None:
+def _declared_costs(selector: str, tasks: "list[TaskSpec]", policies: "list[PolicySpec]", weights: "RewardWeights") -> dict[str, Any]:
+    """Settings by which a selector that wants to know what policies cost is told what their files declare."""
+    from osel_sim.costs import expected_costs
+    from osel_sim.selection.registry import setting_names
+
+    if "expected_costs" not in setting_names(selector):
+        return {}
+    # Half of the horizon is about what a success takes; how costs differ from task to task is learned.
+    actions = sum(task.horizon for task in tasks) // (2 * len(tasks))
+    return {"expected_costs": expected_costs(policies, weights, max(1, actions))}
+
+
+def _log(folder: Path, encoder: str, policies: "list[PolicySpec]") -> "LoggedOutcomes":
+    """The rollout log of a warm start."""
+    from osel_sim.offline.log import read_log
+
+    return read_log(folder, encoder).only([spec.name for spec in policies])
+
+
+def _start_warm(live: "LiveRun", log: "LoggedOutcomes", episodes: int, seed: int) -> None:
+    """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
+    from osel_sim.offline.beforehand import Beforehand, show
+
+    own = live.instance_keys(episodes)
+    log = log.take([row for row, key in enumerate(log.keys) if key not in own])
+    count = show(live.selector, Beforehand(log.contexts, log.rewards(live.weights)), live.selector.policies, seed)
+    print(f"shown beforehand: {count} outcomes of {len(log)} instances of {log.source}, none of them of this run", file=sys.stderr)
+
+
+def _check_selector(name: str, policies: list[str], warm: bool) -> None:
     """Refuse an unknown selector before anything heavy is loaded."""
     from osel_sim.selection.registry import selector_locations
 
@@ -244,6 +280,10 @@ def _check_selector(name: str, policies: list[str]) -> None:
         raise UnknownNameError("selector", name, selector_locations(), "fixed:POLICY for always the same one")
     if kind == "fixed" and policy not in policies:
         raise UnknownNameError("policy", policy, policies, "give --selector fixed:POLICY")
+    if warm:
+        from osel_sim.offline.beforehand import check_can_start_warm
+
+        check_can_start_warm(kind)
 
 
 def _weights(options: argparse.Namespace) -> "RewardWeights":
@@ -278,8 +318,10 @@ def _configuration(
     """Everything the journal depends on but the encoder, content of files included. `above`: axes at levels of their own."""
     from dataclasses import asdict
 
-    from osel_sim.formats.run_config import content_digests
+    from osel_sim.formats.rollout_log import ROLLOUTS
+    from osel_sim.formats.run_config import content_digests, digest
 
+    warm = {"warm_start": digest(options.warm_start / ROLLOUTS)} if options.warm_start else {}
     return {
         "tasks": [task.name for task in tasks],
         "episodes": options.episodes,
@@ -292,7 +334,7 @@ def _configuration(
         "split": options.split,
         "reward": asdict(weights),
         "counterfactual": options.counterfactual,
-        "content": content_digests(tasks, everyone),
+        "content": {**content_digests(tasks, everyone), **warm},
     }
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
+from synthetic_log import make_row, write_log
 
 from osel_sim import run
 from osel_sim.formats.journal import read_journal
@@ -118,6 +119,25 @@ def test_noise_on_actions_reaches_the_robot(tmp_path):
     assert lengths[0] != lengths[1]
 
 
+def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world):
+    rates = {"calm": 0.9, "wild": 0.1}
+    chance = np.random.default_rng(0)
+    keys = [f"short/test/0/{seed}" for seed in range(40)]
+    rows = [make_row(key, policy, success=bool(chance.random() < rate)) for key in keys for policy, rate in rates.items()]
+    log = write_log(world / "log", rows, {key: chance.normal(size=53).astype(np.float32) for key in keys}, encoder="colours")
+    out = world / "warm"
+    flags = ["--selector", "auto", "--episodes", 4, "--out", out]
+    done = execute(world, "run", *flags, "--warm-start", log)
+    assert done.returncode == 0, done.stderr
+    assert f"shown beforehand: 72 outcomes of 36 instances of {log}, none of them of this run" in done.stderr
+    decisions = read_journal(out / "episodes.jsonl")
+    assert decisions[0].propensities["calm"] > 0.99 and [decision.policy for decision in decisions] == ["calm"] * 4
+    assert user(world, *flags, "--resume") == 2  # without the log it would be another run
+    before = (out / "selector.safetensors").read_bytes()
+    assert execute(world, "run", *flags, "--warm-start", log, "--resume").returncode == 0
+    assert (out / "selector.safetensors").read_bytes() == before
+
+
 def test_ctrl_c_ends_with_what_there_is(world):
     folder = world / "interrupted"
     arguments = command(world, "run", "--episodes", 500, "--out", folder, "--selector", "random")
@@ -158,6 +178,8 @@ def test_a_dead_server_is_replaced_by_the_local_policy_and_the_journal_says_so(w
         (["--selector", "pop"], "unknown selector 'pop': did you mean 'ppo'?"),
         (["--selector", "fixed:clam"], "did you mean 'calm'?"),
         (["--encoder", "colour"], "unknown encoder 'colour': did you mean 'colours'?"),
+        (["--selector", "ppo", "--warm-start", "."], "cannot start warm; those that can: auto, "),
+        (["--selector", "auto", "--warm-start", "."], "rollouts.parquet"),
         (["--preset", "waym"], "did you mean 'waymo'?"),
         (["--episodes", "0"], "--episodes: must be 1 or more, got 0"),
         (["--alpha-time", "-0.1"], "--alpha-time: must be a number of 0 or more"),

@@ -15,27 +15,16 @@ from numpy.typing import NDArray
 from osel_sim.children import end_with_parent
 from osel_sim.errors import OselError
 from osel_sim.formats.replay_result import Choices
+from osel_sim.offline.beforehand import Beforehand, show
 from osel_sim.offline.log import LoggedOutcomes
 from osel_sim.offline.streams import Streams, draw_streams
-from osel_sim.selection.protocol import Choice, Selector
 from osel_sim.selection.reward import RewardWeights
 
 WARM = ":warm"
 """Ending of the name of a selector that is shown all outcomes of other instances before its stream begins."""
 
-_WARM_SALT = 0x3A2E
-"""Keeps the order of what is shown beforehand apart from other random numbers of the same seed."""
-
 SLOW_FIRST = ("ppo", "auto:warm", "auto", "neural_linear", "ppo_tuned", "vw_regcb", "vw_squarecb")
 """Selectors whose replays take longest are begun first, so that no worker is left with a long one at the end."""
-
-
-@dataclass(frozen=True)
-class Beforehand:
-    """Outcomes that a selector is shown before its stream: contexts float32 (M, D) of other instances, rewards (M, P, R), NaN where there is none."""
-
-    contexts: NDArray[np.float32]
-    rewards: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -111,7 +100,7 @@ def replay_one(
 
     selector = make_selector(name, policies, contexts.shape[1], seed, **settings)
     if beforehand is not None:
-        _show(selector, beforehand, policies, seed)
+        show(selector, beforehand, policies, seed)
     if isinstance(selector, PPOSelector) and supports(selector):
         return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
     column = {policy: index for index, policy in enumerate(policies)}
@@ -121,14 +110,6 @@ def replay_one(
         chosen[decision] = column[choice.policy]
         selector.update(context, choice, float(rewards[decision, chosen[decision]]))
     return chosen
-
-
-def _show(selector: Selector, beforehand: Beforehand, policies: Sequence[str], seed: int) -> None:
-    """Let a selector learn from every outcome, as if each had been chosen by chance."""
-    chances = {policy: 1.0 / len(policies) for policy in policies}
-    known = np.argwhere(np.isfinite(beforehand.rewards))
-    for row, column, repeat in np.random.default_rng([_WARM_SALT, seed]).permutation(known):
-        selector.update(beforehand.contexts[row], Choice(policies[column], chances), float(beforehand.rewards[row, column, repeat]))
 
 
 def _slowness(name: str) -> int:

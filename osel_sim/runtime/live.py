@@ -155,6 +155,10 @@ class LiveRun:
         self._learn(context, choice, decision.reward)
         return decision
 
+    def instance_keys(self, count: int) -> frozenset[str]:
+        """Keys of the instances of the first `count` decisions."""
+        return frozenset(self._instance(index).key for index in range(count))
+
     def close(self) -> None:
         """Close the files and write the contexts."""
         self.cache.save()
