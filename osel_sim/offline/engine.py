@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.children import end_with_parent
-from osel_sim.errors import OselError
+from osel_sim.errors import OselError, UsageError
 from osel_sim.formats.replay_result import Choices
 from osel_sim.offline.beforehand import Beforehand, show
 from osel_sim.offline.log import LoggedOutcomes
@@ -62,7 +62,14 @@ def replay(
         settings: selector -> keyword arguments, where they are not to be the defaults.
         progress: called with a number of decisions made.
         beforehand: of other instances than the log's; needed for selectors named `NAME:warm`.
+
+    Raises:
+        UsageError: a selector is to start warm and there is nothing to show it.
     """
+    if beforehand is None and any(name.endswith(WARM) for name in selectors):
+        raise UsageError(
+            f"{', '.join(name for name in selectors if name.endswith(WARM))}: there are no outcomes of other instances to show beforehand"
+        )
     table = log.rewards(weights)
     streams = draw_streams(table, seeds, decisions)
     material = _Material(log.contexts, table, streams, tuple(seeds), log.policies, settings or {}, beforehand)
