@@ -53,7 +53,7 @@ def parser() -> cli.Parser:
     add("--action-noise", type=cli.non_negative_float, default=0.0, metavar="S", help=NOISE_HELP)
     add("--split", choices=SPLITS, default="test", help="which instances (default: %(default)s)")
     add("--start-seed", type=cli.non_negative_int, default=0, metavar="S", help="seed of the first instance (default: %(default)s)")
-    add("--encoder", metavar="NAME", help="osel_small (default), MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
+    add("--encoder", metavar="NAME", help="osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
     add("--out", type=Path, metavar="DIR", help="where to write")
     add("--resume", action="store_true", help="go on with the recording in --out, or add policies or an encoder's contexts to it")
     add("--summary", type=cli.folder, metavar="DIR", help="print the tables of the log in DIR, and leave")

@@ -66,7 +66,7 @@ def parser() -> cli.Parser:
     add("--axis", action="append", default=[], metavar="AXIS=LEVEL", help="one axis at a level of its own, such as camera=2; repeatable")
     add("--action-noise", type=cli.non_negative_float, default=0.0, metavar="S", help=NOISE_HELP)
     add("--split", choices=SPLITS, default="test", help="which instances (default: %(default)s)")
-    add("--encoder", metavar="NAME", help="osel_small (default), MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
+    add("--encoder", metavar="NAME", help="osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
     add("--preset", metavar="NAME", help=f"reward weights of the paper: mmlu, waymo, alfred, oxe (default: {DEFAULT_PRESET})")
     add("--alpha-time", type=cli.non_negative_float, metavar="A", help="weight of time in the reward (default: the preset's)")
     add("--alpha-price", type=cli.non_negative_float, metavar="A", help="weight of the price in cents (default: the preset's)")
