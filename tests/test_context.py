@@ -99,6 +99,23 @@ def test_pictures_find_their_instructions_on_unseen_scenes(encoder: Encoder, tas
     assert measured["probes"]["object"] > 0.9
 
 
+def test_the_encoder_of_all_tasks_tells_them_apart() -> None:
+    tasks = [load_task_file(content.find("tasks", name)) for name in ("lift", "push", "open_drawer", "press_button")]
+    scenes = [render_scenes(task, range(8), "test", 96, (0, 2)) for task in tasks]
+    pictured = [([image], text) for one in scenes for image, text in zip(one.images, one.instructions.tolist(), strict=True)]
+    contexts = encode_many(load_encoder("osel_suite"), pictured)
+    near = contexts @ contexts.T - 9.0 * np.eye(len(contexts))
+    assert np.mean(near.argmax(axis=1) // 8 == np.arange(len(contexts)) // 8) > 0.8
+
+
+def test_levels_of_scenes_take_turns(task: TaskSpec) -> None:
+    turned = render_scenes(task, range(2), "train", 48, (0, 2))
+    for seed, level in ((0, 0), (1, 2)):
+        alone = render_scenes(task, [seed], "train", 48, (level,))
+        np.testing.assert_array_equal(turned.images[seed], alone.images[0])
+    assert not np.array_equal(turned.images[1], render_scenes(task, [1], "train", 48).images[0])
+
+
 @pytest.mark.parametrize("image", [np.zeros((96, 96), np.uint8), np.zeros((96, 96, 3), np.float32), np.zeros((3, 96, 96), np.uint8)])
 def test_an_image_of_another_form_is_refused(encoder: Encoder, image: np.ndarray) -> None:
     with pytest.raises(UsageError, match=r"uint8 \(H, W, 3\)"):
@@ -255,7 +272,7 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
     from osel_sim.context import train as training
     from osel_sim.context.train import Settings, train
 
-    settings = Settings(tasks=("pick_place", "sort"), steps=4, scenes=24, test_scenes=12, views=8, texts=8)
+    settings = Settings(tasks=("pick_place", "sort"), levels=(0, 2), steps=4, scenes=24, test_scenes=12, views=8, texts=8)
     whole = train(settings, tmp_path, tmp_path / "whole")
     batches: list[recipe.Batch] = []
     make_batch = recipe.make_batch

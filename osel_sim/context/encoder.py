@@ -56,7 +56,7 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
     """Load an encoder.
 
     Args:
-        name: an embedded one (`osel_small`, `osel_suite`); `MODEL:TAG` for any open_clip model and pretrained tag (`ViT-L-14:openai`), downloaded once;
+        name: an embedded one (`osel_small`, `osel_suite`); `MODEL:TAG` for any open_clip model and pretrained tag (`ViT-L-14:openai`), fetched once;
             `MODEL:/path/to/weights.safetensors` (or `.bin`, `.pt`) for weights at hand; an open_clip folder (config and weights);
             `hf-hub:ORGANISATION/REPOSITORY`; `sentence:MODEL` for a sentence-transformers model, which looks at no images (a folder or a name of the
             model hub, such as `sentence:all-MiniLM-L6-v2`); `IMAGES+sentence:MODEL` for images by one and text by the other; or a name of the

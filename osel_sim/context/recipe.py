@@ -103,13 +103,14 @@ class Objective:
 
     Pairs teach quickly what is there, and slowly where; a readout of where things are speeds that up. Captions that claim the same should embed
     alike, but a selector may want to know how something was said; a readout of the words used keeps that in the text embedding. Pairs say nothing
-    of what is to be done with the things named; where there are several tasks, a readout of an instruction's task does.
+    of what is to be done with the things named; where there are several tasks, a readout of an instruction's task does. It reads from angles alone
+    and wants them wide: that tasks can be told apart is not enough for a selector that goes by distances.
 
     Args:
         entities: task -> how many things can be in its scenes.
     """
 
-    where_weight, wording_weight, task_weight = 1.0, 0.05, 0.2
+    where_weight, wording_weight, task_weight, task_scale = 1.0, 0.05, 0.3, 5.0
 
     def __init__(self, model: Any, entities: Mapping[str, int]) -> None:
         import torch
@@ -117,7 +118,7 @@ class Objective:
         self.model, self._tasks = model, list(entities)
         width = model.text_projection.shape[1]
         where = {f"where_{task}": torch.nn.Linear(width, 2 * count) for task, count in entities.items()}
-        told = {"task": torch.nn.Linear(width, len(entities))} if len(entities) > 1 else {}
+        told = {"task": torch.nn.Linear(width, len(entities), bias=False)} if len(entities) > 1 else {}
         self.readouts = torch.nn.ModuleDict({**where, "wording": torch.nn.Linear(width, model.vocab_size), **told})
         self.readouts.to(model.logit_scale.device)
 
@@ -161,5 +162,6 @@ class Objective:
 
         if "task" not in self.readouts or not len(texts):
             return texts.new_zeros(())
-        said = functional.log_softmax(self.readouts["task"](10 * texts), dim=1)
+        prototypes: Any = self.readouts["task"].weight
+        said = functional.log_softmax(self.task_scale * texts @ functional.normalize(prototypes, dim=1).T, dim=1)
         return -said[:, self._tasks.index(task)].mean()

@@ -41,10 +41,10 @@ class KernelUCBSelector(BayesianSelector):
         expected_costs: Mapping[str, float] | None = None,
         warm_contexts: ArrayLike | None = None,
         components: int = 32,
-        whitening: float = 0.5,
+        whitening: float = 0.25,
         width: float = 0.7,
         landmarks: int = 64,
-        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8),
+        signals: Sequence[float] = (1e-6, 2.0),
         optimism: float = 1.0,
         chance: float = 0.1,
     ) -> None:
