@@ -27,7 +27,7 @@ EXAMPLES = """examples:
   python -m osel_sim.run --list                                            # tasks and policies there are
   python -m osel_sim.run --task pick_place --episodes 60 --counterfactual  # PPO, compared with what could have been
   python -m osel_sim.run --task tag:short --level 0 2 --episodes 200       # several tasks and levels, mixed
-  python -m osel_sim.run --task all --level 0 2 --selector auto --warm-start assets/logs/suite   # it has seen the outcomes of a log
+  python -m osel_sim.run --task all --level 0 2 --selector auto --encoder osel_suite --warm-start assets/logs/suite   # it has seen a log's outcomes
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first --resume
 

@@ -57,10 +57,11 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
     ]
     caption = (
         "Means with 95% bootstrap intervals over seeds, the best first. Regret: reward a decision below the oracle. Gap closed: share of the way "
-        "from the best single policy to the learnable oracle"
-        + ("" if predictable else ", in the last quarter also to the predictable one")
-        + ". Ahead after: decisions until its rewards pass the best single policy's for good."
+        f"from the best single policy to the learnable oracle{'' if predictable else ', in the last quarter also to the predictable one'}. "
+        "Ahead after: decisions until its rewards pass the best single policy's for good."
     )
+    if any(name.endswith(":warm") for name in names):
+        caption += " A selector named :warm was shown the outcomes of the log's other half before its first decision."
     return Table("selectors", "What each selector came to", caption, columns, rows)
 
 
