@@ -42,7 +42,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
                 **{key: entry[key] for key in ("mean_seconds", "mean_price")},
                 "gap": gaps(entry)[0] if learns else None,
                 "gap_late": gaps(entry)[1] if learns else None,
-                "predictable_late": _estimate(entry, "predictable_gap_closed_late") if learns else None,
+                **({} if predictable else {"predictable_late": _estimate(entry, "predictable_gap_closed_late") if learns else None}),
                 **{f"regret_{oracle}": _of(entry, "regret", oracle) for oracle in result["oracles"] if oracle in ORACLES},
                 "ahead": entry["decisions_until_ahead"] if learns else None,
             }
