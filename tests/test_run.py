@@ -15,6 +15,7 @@ from synthetic_log import make_row, write_log
 
 from osel_sim import run
 from osel_sim.formats.journal import read_journal
+from osel_sim.selection.state import load_state
 
 EPISODES = 6
 
@@ -133,9 +134,9 @@ def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world):
     decisions = read_journal(out / "episodes.jsonl")
     assert decisions[0].propensities["calm"] > 0.99 and [decision.policy for decision in decisions] == ["calm"] * 4
     assert user(world, *flags, "--resume") == 2  # without the log it would be another run
-    before = (out / "selector.safetensors").read_bytes()
+    before = load_state(out / "selector.safetensors")
     assert execute(world, "run", *flags, "--warm-start", log, "--resume").returncode == 0
-    assert (out / "selector.safetensors").read_bytes() == before
+    np.testing.assert_equal(load_state(out / "selector.safetensors"), before)
 
 
 def test_ctrl_c_ends_with_what_there_is(world):
