@@ -44,7 +44,7 @@ class KernelUCBSelector(BayesianSelector):
         whitening: float = 0.25,
         width: float = 0.7,
         landmarks: int = 64,
-        signals: Sequence[float] = (1e-6, 2.0),
+        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8, 2.0),
         optimism: float = 1.0,
         chance: float = 0.1,
     ) -> None:
