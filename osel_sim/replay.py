@@ -111,7 +111,8 @@ def _replay(
     if left_out.instances:
         print(f"warning: {left_out.instances} instances without an outcome of every policy are left out", file=sys.stderr)
     best = oracles(log, weights)
-    choices = with_fixed(_replay_all(log, weights, selectors, costs, options, Beforehand(others.contexts, others.rewards(weights))), best)
+    beforehand = Beforehand(others.contexts, others.rewards(weights)) if options.half else None
+    choices = with_fixed(_replay_all(log, weights, selectors, costs, options, beforehand), best)
     result = build(log, weights, preset, choices, best, left_out, range(options.seeds))
     result["log"]["half"] = options.half
     result["off_policy"] = off_policy
@@ -146,13 +147,13 @@ def _replay_all(
     selectors: Sequence[str],
     costs: "dict[str, float] | None",
     options: argparse.Namespace,
-    beforehand: "Beforehand",
+    beforehand: "Beforehand | None",
 ) -> "Choices":
     """Run the replays, with a progress bar.
 
     Args:
         costs: of each policy, for those selectors that want to know them beforehand; None: for none.
-        beforehand: shown to selectors named `NAME:warm`.
+        beforehand: shown to selectors named `NAME:warm`; None where there is no other half.
     """
     from tqdm import tqdm  # type: ignore[import-untyped]
 

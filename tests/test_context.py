@@ -267,6 +267,19 @@ def test_captions_are_judged_by_what_is_in_view(task: TaskSpec) -> None:
     assert truth(facts, [Caption("", claim) for claim in claims])[0].tolist() == [1, -1, -1, 0, -1, 1, -1, 0]
 
 
+def test_an_instruction_is_drawn_to_its_task_where_there_are_several() -> None:
+    import open_clip
+    import torch
+
+    from osel_sim.context.recipe import MODEL, Objective
+
+    model = open_clip.CLIP(**MODEL)
+    both, one = Objective(model, {"lift": 1, "push": 1}), Objective(model, {"lift": 1})
+    towards_lift = torch.nn.functional.normalize(both.readouts["task"].weight, dim=1)[:1]
+    assert both._task("lift", towards_lift) < both._task("push", towards_lift)
+    assert one._task("lift", towards_lift) == both._task("lift", towards_lift[:0]) == 0.0
+
+
 def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from osel_sim.context import recipe
     from osel_sim.context import train as training

@@ -60,9 +60,7 @@ def test_result(replayed, log):
     best = result["selectors"]["linucb"]
     assert best["learnable_gap_closed"] == pytest.approx(gap)
     assert best["learnable_gap_closed_late"] > best["learnable_gap_closed"] > 0.4
-    assert (
-        best["predictable_gap_closed"] == best["learnable_gap_closed"]
-    )  # there are no repeats, so the predictable oracle bounds what can be learned
+    assert best["predictable_gap_closed"] == best["learnable_gap_closed"]  # the same oracle, where there are no repeats
     assert best["regret"]["hindsight"] == pytest.approx(oracles["hindsight"] - means["linucb"])
     assert 0 < best["decisions_until_better"] < best["decisions_until_ahead"] < 300
     assert result["selectors"]["thompson"]["decisions_until_ahead"] is None
@@ -108,6 +106,9 @@ def test_repeats_missing_outcomes_and_the_half(tmp_path: Path, log):
     assert result["log"]["instances"] == 59 and result["log"]["left_out"]["by_policy"] == {"policy_0": 0, "policy_1": 1}
     assert "made_up/7" not in choices.instances and choices.repeats.max() == 3
     assert "expected" in result["oracles"] and result["learnable_oracle"]["name"] == "expected"
+    chance, best = result["selectors"]["random"], result["oracles"]["best_single"]["mean_reward"]
+    gap = result["oracles"]["predictable"]["mean_reward"] - best
+    assert chance["predictable_gap_closed"] == pytest.approx((chance["mean_reward"] - best) / gap) != chance["learnable_gap_closed"]
     assert run(log, "--half", "score", "--selectors", "random", "--seeds", 2, "--decisions", 50, "--out", tmp_path / "half", *FREE) == 0
     result, choices = read_replay(tmp_path / "half")
     assert 250 < result["log"]["instances"] < 350 and choices.order.shape == (2, 50)

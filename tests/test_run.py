@@ -135,6 +135,8 @@ def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world):
     assert decisions[0].propensities["calm"] > 0.99 and [decision.policy for decision in decisions] == ["calm"] * 4
     assert user(world, *flags, "--resume") == 2  # without the log it would be another run
     before = load_state(out / "selector.safetensors")
+    costs = before["settings"]["expected_costs"]  # as the policy files declare them
+    assert costs["wild"] > costs["calm"]
     assert execute(world, "run", *flags, "--warm-start", log, "--resume").returncode == 0
     np.testing.assert_equal(load_state(out / "selector.safetensors"), before)
 

@@ -72,10 +72,7 @@ def setting_names(name: str) -> list[str]:
     Raises:
         UnknownNameError: no such selector.
     """
-    kind = name.partition(":")[0]
-    if kind not in selector_locations():
-        raise UnknownNameError("selector", name, selector_locations())
-    return _settings(_factory(selector_locations()[kind]))
+    return _settings(_find(name))
 
 
 def learns_off_policy(name: str) -> bool:
@@ -84,10 +81,14 @@ def learns_off_policy(name: str) -> bool:
     Raises:
         UnknownNameError: no such selector.
     """
-    kind = name.partition(":")[0]
-    if kind not in selector_locations():
-        raise UnknownNameError("selector", name, selector_locations())
-    return bool(getattr(_factory(selector_locations()[kind]), "off_policy", False))
+    return bool(getattr(_find(name), "off_policy", False))
+
+
+def _find(name: str) -> Any:
+    kind, locations = name.partition(":")[0], selector_locations()
+    if kind not in locations:
+        raise UnknownNameError("selector", name, locations)
+    return _factory(locations[kind])
 
 
 def _factory(location: str) -> Any:
