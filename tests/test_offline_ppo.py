@@ -1,5 +1,10 @@
 """PPO's quick replay against SB3's own code: the same choices and, to rounding, the same weights."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -73,6 +78,23 @@ def test_what_is_not_covered_goes_through_sb3():
     assert not supports(make_selector("ppo", POLICIES, 8, 3, **settings))
     expected = decision_by_decision(make_selector("ppo", POLICIES, 8, 3, **settings), contexts, rewards)
     assert (replay_one("ppo", contexts, rewards, POLICIES, 3, **settings) == expected).all()
+
+
+def test_compiled_afresh_or_from_the_cache_it_is_the_same_to_the_bit(tmp_path):
+    code = (
+        "import hashlib, test_offline_ppo as tests\n"
+        "contexts, rewards = tests.problem(200, 64)\n"
+        "quick = tests.FastPPO(tests.make_selector('ppo', tests.POLICIES, 64, 7))\n"
+        "quick.run(contexts, rewards)\n"
+        "print(hashlib.sha256(tests.weights([*quick.actor[:1], *quick.critic[:1]]).tobytes()).hexdigest())"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "OMP_NUM_THREADS": "1"}
+    here = Path(__file__).parent
+    first, second = (
+        subprocess.run([sys.executable, "-c", code], cwd=here, env=environment, capture_output=True, text=True, check=True) for _ in range(2)
+    )
+    assert list(tmp_path.rglob("*train*.nbc"))
+    assert first.stdout == second.stdout
 
 
 def test_it_learns():

@@ -136,7 +136,8 @@ def forward(weights, sizes, inputs, activations):  # type: ignore[no-untyped-def
         offset = bias + n_out
 
 
-@njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
+# Inlined, because otherwise what a process has compiled itself and what it takes from the cache round differently, and replays with them.
+@njit(cache=True, fastmath=True, nogil=True, error_model="numpy", inline="always")
 def backward(weights, sizes, activations, deltas, batch):  # type: ignore[no-untyped-def]
     """Carry `deltas[-1]` (the loss by the outputs) back to all layers: deltas (layers, batch, widest) by each layer's sums before tanh."""
     layers = len(sizes) - 1
