@@ -70,6 +70,7 @@ def _record(options: argparse.Namespace) -> int:
     from osel_sim.runtime.recording import Recording
     from osel_sim.runtime.workers import Plan
     from osel_sim.sim.gl import choose_backend
+    from osel_sim.skills import declare
 
     added_encoder = options.encoder is not None  # one given is added; the encoder that was there must not have changed
     if options.resume and not options.task and options.out is not None:
@@ -113,12 +114,13 @@ def _record(options: argparse.Namespace) -> int:
     known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
     check_folder(folder, known, options.resume)
     encoder = load_encoder(encoder_name)
+    skills = declare(policies, encoder, options.tasks)
     configuration["encoder"] = encoder.identity
     known["encoder"] = before.get("configuration", {}).get("encoder") if before and added_encoder else encoder.identity
     ran_with = environment(choose_backend(), content.root())
     for warning in start_or_resume(folder, known, ran_with, options.resume):
         print(f"warning: {warning}", file=sys.stderr)
-    recording = Recording(folder, plan, encoder.identity)
+    recording = Recording(folder, plan, encoder.identity, skills)
     if recording.complete:
         print(f"{folder} is complete")
     else:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from osel_sim.offline.log import LoggedOutcomes
     from osel_sim.selection.reward import RewardWeights
 
-COSTS = "expected_costs"
+COSTS, SKILLS = "expected_costs", "skills"
 """Setting of selectors that take what policies cost from what is declared of them, rather than learn it."""
 
 EXAMPLES = """examples:
@@ -76,6 +76,7 @@ def parser() -> cli.Parser:
     add("--time-unit", choices=("log10-seconds", "steps"), help="of time in the reward (default: the preset's)")
     add("--success", choices=("success", "subgoals", "score"), help="what counts as success in the reward (default: the preset's)")
     add("--unknown-costs", action="store_true", help="let all selectors learn what policies cost (default: auto is told, as it is declared)")
+    add("--unknown-skills", action="store_true", help="do not tell auto what policies were made for (default: it is told what the log says of it)")
     add("--encoder", metavar="NAME", help="whose contexts, where the log has several (default: the one it was recorded with)")
     add("--workers", type=cli.positive_int, default=2, metavar="W", help="processes (default: %(default)s)")
     add("--out", type=Path, metavar="DIR", help="where to write (default: runs/replay-LOG)")
@@ -117,6 +118,7 @@ def _replay(
     result["log"]["half"] = options.half
     result["off_policy"] = off_policy
     result["expected_costs"] = costs
+    result["skills"] = None if log.skills is None or options.unknown_skills else {policy: list(names) for policy, names in log.skills.able.items()}
     write_replay(folder, result, choices, tables(result))
     print_replay(console(), result)
 
@@ -160,9 +162,10 @@ def _replay_all(
     from osel_sim.offline.engine import replay
     from osel_sim.selection.registry import setting_names
 
-    told = (
-        {name: {COSTS: costs} for name in selectors if COSTS in setting_names(name)} if costs is not None and set(costs) == set(log.policies) else {}
-    )
+    known: dict[str, Any] = {COSTS: costs} if costs is not None and set(costs) == set(log.policies) else {}
+    if log.skills is not None and not options.unknown_skills:
+        known[SKILLS] = log.skills
+    told = {name: {key: value for key, value in known.items() if key in setting_names(name)} for name in selectors}
     decisions = len(log) if options.decisions is None else options.decisions
     with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
         return replay(log, weights, selectors, range(options.seeds), options.decisions, options.workers, told, bar.update, beforehand)

@@ -12,6 +12,7 @@ from osel_sim import cli, content
 from osel_sim.errors import OselError, UnknownNameError
 
 if TYPE_CHECKING:
+    from osel_sim.context.encoder import Encoder
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.formats.task_file import TaskSpec
     from osel_sim.offline.log import LoggedOutcomes
@@ -125,7 +126,7 @@ def _run(options: argparse.Namespace) -> int:
 
     # The last bits of a matrix product depend on the number of threads; one, so that a run does not depend on how many there are.
     torch.set_num_threads(1)
-    known = _declared_costs(options.selector, tasks, policies, weights)
+    known = _declared(options.selector, tasks, policies, weights, encoder, options.tasks)
     selector = make_selector(options.selector, [spec.name for spec in policies], encoder.dimension, options.seed, **known)
     print(f"{_title(tasks)}: loading {', '.join(spec.name for spec in everyone)}, starting servers ...", file=sys.stderr)
     with contextlib.ExitStack() as stack:
@@ -242,16 +243,26 @@ def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:
     }
 
 
-def _declared_costs(selector: str, tasks: "list[TaskSpec]", policies: "list[PolicySpec]", weights: "RewardWeights") -> dict[str, Any]:
-    """Settings by which a selector that wants to know what policies cost is told what their files declare."""
+def _declared(
+    selector: str, tasks: "list[TaskSpec]", policies: "list[PolicySpec]", weights: "RewardWeights", encoder: "Encoder", extra: Path | None
+) -> dict[str, Any]:
+    """Settings by which a selector is told what policies declare, as far as it wants to know: what they cost, and what they were made for.
+
+    Args:
+        extra: folder with the user's own task files.
+    """
     from osel_sim.costs import expected_costs
     from osel_sim.selection.registry import setting_names
+    from osel_sim.skills import declare
 
-    if "expected_costs" not in setting_names(selector):
-        return {}
-    # Half of the horizon is about what a success takes; how costs differ from task to task is learned.
-    actions = sum(task.horizon for task in tasks) // (2 * len(tasks))
-    return {"expected_costs": expected_costs(policies, weights, max(1, actions))}
+    wanted, known = setting_names(selector), dict[str, Any]()
+    if "expected_costs" in wanted:
+        # Half of the horizon is about what a success takes; how costs differ from task to task is learned.
+        actions = sum(task.horizon for task in tasks) // (2 * len(tasks))
+        known["expected_costs"] = expected_costs(policies, weights, max(1, actions))
+    if "skills" in wanted:
+        known["skills"] = declare(policies, encoder, extra)
+    return known
 
 
 def _log(folder: Path, encoder: str, policies: "list[PolicySpec]") -> "LoggedOutcomes":

@@ -43,6 +43,8 @@ def test_a_whole_file_is_read(tmp_path: Path) -> None:
     assert spec.price == Price(0.02, 1.0, 0.0)
     assert spec.price.of(actions=100, calls=3, megabytes=7.0) == pytest.approx(5.0)
     assert (spec.cameras, spec.image_size, spec.execute, spec.is_remote) == (("agentview", "wrist"), 96, 8, True)
+    assert spec.skills is None
+    assert load_policy_file(write(tmp_path, GOOD.replace("execute = 8", 'execute = 8\nskills = ["lift", "tag:long"]'))).skills == ("lift", "tag:long")
 
 
 def test_a_local_policy_needs_no_remote_and_no_price(tmp_path: Path) -> None:
@@ -87,6 +89,8 @@ def test_a_local_policy_needs_no_remote_and_no_price(tmp_path: Path) -> None:
         ("[price]", "[prices]", "prices: is not a known key, did you mean 'price'?"),
         ("[observation]", "[observation", "TOML: "),
         ("execute = 8", "execute = 8\nexecute = 9", "TOML: "),
+        ("execute = 8", "execute = 8\nskills = []", "skills: must name at least one task"),
+        ("execute = 8", 'execute = 8\nskills = "lift"', "skills: must be a list, got 'lift'"),
     ],
 )
 def test_a_broken_file_is_refused_with_file_key_and_what_would_be_right(old: str, new: str, message: str, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from run_helpers import HORIZON, command, environment, execute, make_world, wait
 from osel_sim import content, record
 from osel_sim.context.cache import ContextCache
 from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.formats.run_config import digest
 from osel_sim.formats.task_file import load_task_file
 from osel_sim.offline.log import read_log
 from osel_sim.runtime.workers import Plan
@@ -117,6 +118,31 @@ def test_contexts_of_another_encoder_are_added(world, reference):
     assert np.array_equal(new.table("colours", keys), old.table("colours", keys))
     assert len(np.unique(new.table("osel_small", keys), axis=0)) == INSTANCES
     assert read_log(folder).encoder == metadata["encoder"]
+
+
+def test_a_log_knows_what_its_policies_declare(world, reference):
+    """A log made before it was declared learns of it without an episode."""
+    folder, own = world / "declared", world / "declaring"
+    shutil.copytree(reference[0], folder)
+    assert read_log(folder).skills is None
+    shutil.copytree(world / "policies", own)
+    run = json.loads((folder / "run.json").read_text())
+    for name, skills in (("calm", '["lift", "push"]'), ("wild", '["short"]')):
+        file = own / f"{name}.toml"
+        file.write_text(file.read_text().replace("execute = 8", f"execute = 8\nskills = {skills}"))
+        run["configuration"]["content"][f"policy {name}"] = digest(file)
+    (folder / "run.json").write_text(json.dumps(run))
+    arguments = list(map(str, ["--resume", "--out", folder, "--tasks", world / "tasks", "--policies-dir", own]))
+    assert record.main(arguments) == 0
+    log = read_log(folder)
+    assert log.skills is not None and log.skills.able == {"calm": ("lift", "push"), "wild": ("short",)}
+    assert log.skills.nearest(log.contexts[0]) == "short"
+    assert read_rollouts(folder)[0] == read_rollouts(reference[0])[0]
+    before = files(folder)
+    assert record.main(arguments) == 0 and files(folder) == before
+    (own / "wild.toml").write_text((own / "wild.toml").read_text().replace('"short"', '"shrt"'))
+    assert record.main([*arguments[:1], "--out", str(world / "undeclared"), "--task", "short", *arguments[3:], "--policies", "wild"][1:]) == 2
+    assert not (world / "undeclared").exists()
 
 
 def test_a_policy_that_cannot_be_added_leaves_the_log_as_it_was(world, reference, capsys):

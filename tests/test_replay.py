@@ -16,6 +16,7 @@ from synthetic_log import clusters, make_row, write_log
 from osel_sim import replay
 from osel_sim.errors import DataError
 from osel_sim.formats.replay_result import read_replay
+from osel_sim.formats.rollout_log import write_rollouts
 from osel_sim.offline.engine import replay as replay_all
 from osel_sim.offline.log import read_log
 from osel_sim.selection.reward import RewardWeights
@@ -122,6 +123,28 @@ def test_a_warm_start_spares_the_beginning(tmp_path: Path, log):
     first = {name: choices.received(name, begun.rewards(RewardWeights(0.0, 0.0)))[:, :100].mean() for name in ("linucb", "linucb:warm")}
     assert first["linucb:warm"] > first["linucb"] + 0.05
     assert result["selectors"]["linucb:warm"]["kind"] == "learner" and result["selectors"]["linucb:warm"]["decisions_until_ahead"] < 30
+
+
+def test_auto_is_told_what_the_log_says_of_its_policies(tmp_path: Path):
+    """Two kinds of instances, each the business of one policy, and examples of both in the log."""
+    chance = np.random.default_rng(0)
+    centres, rows, contexts = {"dig": np.eye(1, 8)[0], "fly": -np.eye(1, 8)[0]}, [], {}
+    for number in range(80):
+        kind = ("dig", "fly")[number % 2]
+        contexts[f"{kind}/{number}"] = centres[kind] + 0.1 * chance.normal(size=8)
+        rows += [make_row(f"{kind}/{number}", policy, success=bool(chance.random() < (0.9 if policy == kind else 0.1))) for policy in ("dig", "fly")]
+    folder = write_log(tmp_path / "log", rows, contexts | {f"skill:{kind}:{row}": centre for kind, centre in centres.items() for row in range(3)})
+    write_rollouts(folder, rows, {"encoder": "made_up@1", "skills": {"dig": ["dig"], "fly": ["fly"]}})
+    ahead = {}
+    for name, flags in (("told", []), ("untold", ["--unknown-skills"])):
+        assert run(folder, "--selectors", "auto", "--seeds", 4, "--out", tmp_path / name, *FREE, *flags) == 0
+        result, _ = read_replay(tmp_path / name)
+        ahead[name] = result["selectors"]["auto"]["decisions_until_ahead"]
+        assert result["skills"] == (None if flags else {"dig": ["dig"], "fly": ["fly"]})
+    assert ahead["told"] == 1 < ahead["untold"]
+    write_rollouts(folder, rows, {"encoder": "made_up@1", "skills": "dig"})
+    with pytest.raises(DataError, match="skills in its metadata must be an object of lists of names, got 'dig'"):
+        read_log(folder)
 
 
 @pytest.mark.slow

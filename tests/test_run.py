@@ -136,7 +136,7 @@ def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world):
     assert user(world, *flags, "--resume") == 2  # without the log it would be another run
     before = load_state(out / "selector.safetensors")
     costs = before["settings"]["expected_costs"]  # as the policy files declare them
-    assert costs["wild"] > costs["calm"]
+    assert costs["wild"] > costs["calm"] and before["settings"]["skills"] is None  # they declare none
     assert execute(world, "run", *flags, "--warm-start", log, "--resume").returncode == 0
     np.testing.assert_equal(load_state(out / "selector.safetensors"), before)
 

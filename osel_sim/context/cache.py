@@ -1,5 +1,6 @@
 """Contexts on disk: `contexts.npz` beside a journal or rollout log, keyed by encoder and instance."""
 
+import itertools
 import os
 import zipfile
 from collections.abc import Callable, Sequence
@@ -18,7 +19,7 @@ class ContextCache:
 
     The file holds for each encoder `<identity>|instances` (N,) unicode, sorted, and `<identity>|contexts` (N, d) float32. It is replaced
     whole and atomically, so a reader or a killed run always finds a complete one, and the same contents are the same bytes.
-    One process writes; workers hand it their contexts.
+    One process writes; workers hand it their contexts. Examples of skills lie among the instances, as `skill:NAME:NUMBER`.
 
     Args:
         folder: where `contexts.npz` lies or will lie.
@@ -54,6 +55,17 @@ class ContextCache:
         if missing:
             raise DataError(f"{self.file}: encoder {encoder!r} has no context of {len(missing)} instances, the first of them {missing[0]!r}")
         return np.stack([known[instance] for instance in instances])
+
+    def examples(self, encoder: str, skill: str) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+        """Contexts (n, d) of the examples of a skill, in order; (0, 0) if there are none."""
+        known = self._contexts.get(self._identity(encoder), {})
+        found = list(itertools.takewhile(lambda context: context is not None, (known.get(_example(skill, row)) for row in itertools.count())))
+        return np.stack([context for context in found if context is not None]) if found else np.zeros((0, 0), np.float32)
+
+    def put_examples(self, encoder: str, skill: str, contexts: Sequence[Context]) -> None:
+        """Add the examples of a skill."""
+        for row, context in enumerate(contexts):
+            self.put(encoder, _example(skill, row), context)
 
     def put(self, encoder: str, instance: str, context: Context) -> None:
         """Add a context; `encoder` is an identity."""
@@ -100,6 +112,10 @@ class ContextCache:
         if len(matches) > 1:
             raise DataError(f"{self.file}: several versions of encoder {encoder!r}: {', '.join(sorted(matches))}; name one of them")
         return matches[0] if matches else encoder
+
+
+def _example(skill: str, row: int) -> str:
+    return f"skill:{skill}:{row}"
 
 
 def _read(file: Path) -> dict[str, dict[str, Context]]:

@@ -57,6 +57,7 @@ class PolicySpec:
         execute: how many actions of each chunk are executed before it is asked again.
         inference_seconds: declared time of one inference on the virtual clock.
         remote: None for a local policy.
+        skills: tasks that it was made for (names, `tag:TAG` or `all`), for selectors that want to know; None: the file does not say.
         mapping: the policy's own names and conventions; those of this package where the file has no such table.
     """
 
@@ -73,6 +74,7 @@ class PolicySpec:
     file: Path
     version: int = 1
     mapping: Mapping = field(default_factory=Mapping)
+    skills: tuple[str, ...] | None = None
 
     @property
     def is_remote(self) -> bool:
@@ -140,7 +142,10 @@ def load_policy_file(file: Path) -> PolicySpec:
         file=file,
         version=version,
         mapping=read_mapping(table.table("mapping", {}), cameras),
+        skills=table.strings("skills") if "skills" in table.data else None,
     )
+    if spec.skills == ():
+        raise table.error("skills", "must name at least one task; leave it out where nothing is known")
     if kind == "openpi" and (remote is None or remote.url is None):
         raise table.error("remote.url", "is missing: a policy of kind 'openpi' is a server of its own, give its address (ws://host:port)")
     if location == "local" and "remote" in table.data:

@@ -24,6 +24,8 @@ SCHEMA_VERSION = 2
 _COLUMNS_ADDED = {2: ("score", "axes")}
 """Columns that came with a version; logs of an earlier one are read without them."""
 ROLLOUTS = "rollouts.parquet"
+DECLARED = "skills"
+"""Key of the metadata that says what policies declare: policy -> names of skills. Examples of them lie among the contexts."""
 _PREFIX = b"osel_sim."
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ def selector_frontier(log: LoggedOutcomes, weights: RewardWeights, selector: str
     """Frontier of a selector that learns, replayed anew at each of a few weights: means over the last quarter of its streams.
 
     Args:
-        log: complete instances only.
+        log: complete instances only. Its skills, if it has any, are told.
         told: whether a selector that takes expected costs is told those of the log.
         seeds: streams at each weight; of 1,000 decisions at most.
     """
@@ -79,7 +80,8 @@ def selector_frontier(log: LoggedOutcomes, weights: RewardWeights, selector: str
     found = []
     for value in swept:
         here = moved(weights, sweep, float(value))
-        settings = {selector: {"expected_costs": log.expected_costs(here)}} if told and "expected_costs" in setting_names(selector) else None
+        known: dict[str, Any] = {"skills": log.skills} | ({"expected_costs": log.expected_costs(here)} if told else {})
+        settings = {selector: {name: value for name, value in known.items() if name in setting_names(selector)}}
         choices = replay(log, here, [selector], range(seeds), decisions, settings=settings)
         found.append([_mean(choices.received(selector, table)[:, late]) for table in (log.success, log.seconds, log.price)])
     success, seconds, price = np.array(found).T

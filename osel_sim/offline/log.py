@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.errors import DataError, UnknownNameError, UsageError
-from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts
+from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts
 from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
+from osel_sim.selection.skills import Skills
 
 Array = NDArray[np.float64]
 Half = Literal["choose", "score"]
@@ -58,6 +59,7 @@ class LoggedOutcomes:
         price: cents.
         errors: bool (N, P, R), the episode ended in error (the rest of what is NaN never ran).
         metadata: of the log.
+        skills: what its policies declared, in that encoder's eyes; None where the log does not say.
     """
 
     source: Path
@@ -76,6 +78,7 @@ class LoggedOutcomes:
     price: Array
     errors: NDArray[np.bool_]
     metadata: dict[str, Any]
+    skills: Skills | None = None
 
     def __len__(self) -> int:
         return len(self.instances)
@@ -197,7 +200,8 @@ def read_log(folder: Path, encoder: str | None = None) -> LoggedOutcomes:
     policies = tuple(name for name in policies if name in {row.policy for row in rows})
     identity, contexts = read_contexts(folder, tuple(instances), encoder or metadata.get("encoder"))
     arrays, errors = dense(folder, rows, tuple(instances), policies)
-    return LoggedOutcomes(folder, tuple(instances.values()), policies, contexts, identity, **arrays, errors=errors, metadata=metadata)
+    skills = read_skills(folder, identity, metadata.get(DECLARED))
+    return LoggedOutcomes(folder, tuple(instances.values()), policies, contexts, identity, **arrays, errors=errors, metadata=metadata, skills=skills)
 
 
 def read_contexts(folder: Path, instances: Sequence[str], encoder: str | None) -> tuple[str, NDArray[np.float32]]:
@@ -221,6 +225,31 @@ def read_contexts(folder: Path, instances: Sequence[str], encoder: str | None) -
         raise DataError(f"{cache.file}: contexts of {encoder!r} are not all finite")
     identity = encoder if encoder in known else next(name for name in known if name.partition("@")[0] == encoder)
     return identity, np.ascontiguousarray(contexts, np.float32)
+
+
+def read_skills(folder: Path, encoder: str, declared: Any) -> Skills | None:
+    """What a log's policies declared, with the examples that lie among its contexts; None where it does not say, or has none of this encoder.
+
+    Args:
+        encoder: identity.
+        declared: policy -> names of skills, of the log's metadata.
+
+    Raises:
+        DataError: `declared` has another form.
+    """
+    from osel_sim.context.cache import ContextCache
+
+    if declared is None:
+        return None
+    if not isinstance(declared, dict) or not all(
+        isinstance(names, list) and all(isinstance(name, str) for name in names) for names in declared.values()
+    ):
+        raise DataError(f"{folder / ROLLOUTS}: {DECLARED} in its metadata must be an object of lists of names, got {declared!r}")
+    cache = ContextCache(folder)
+    examples = {name: cache.examples(encoder, name) for name in sorted({name for names in declared.values() for name in names})}
+    if not examples or any(not len(contexts) for contexts in examples.values()):
+        return None
+    return Skills(examples, {policy: tuple(names) for policy, names in declared.items()})
 
 
 def dense(source: Path, rows: Sequence[Row], instances: Sequence[str], policies: Sequence[str]) -> tuple[dict[str, Array], NDArray[np.bool_]]:

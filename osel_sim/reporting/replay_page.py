@@ -1,7 +1,7 @@
 """The page of a replay."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +103,8 @@ def _log(folder: Path, result: Mapping[str, Any], choices: Choices, log_folder: 
         raise UsageError(f"the log {source} that {folder} was replayed from is not there; give its folder with --log")
     encoder = result["log"]["encoder"]
     log = (read_live(source, encoder).outcomes if is_live_run(source) else read_log(source, encoder)).only(choices.policies)
+    if result.get("skills") is None:  # the selectors were not told
+        log = replace(log, skills=None)
     row = {key: index for index, key in enumerate(log.keys)}
     missing = [key for key in choices.instances if key not in row]
     if missing:

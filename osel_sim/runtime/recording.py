@@ -4,9 +4,10 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim.context.cache import ContextCache
-from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
+from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts, write_rollouts
 from osel_sim.formats.shards import SHARDS, Shards
 from osel_sim.runtime.workers import Episode, Plan, Recorded
+from osel_sim.selection.skills import Skills
 
 
 class Recording:
@@ -14,16 +15,20 @@ class Recording:
 
     Args:
         encoder: identity of the one whose contexts are wanted.
+        skills: what the policies declare; kept with the log.
 
     Attributes:
         grew: something was added.
     """
 
-    def __init__(self, folder: Path, plan: Plan, encoder: str) -> None:
+    def __init__(self, folder: Path, plan: Plan, encoder: str, skills: Skills | None = None) -> None:
         self.folder, self.plan, self.encoder, self.grew = folder, plan, encoder, False
+        self._skills = skills
         self._cache = ContextCache(folder, autosave=0)
         self._rows: dict[str, dict[Episode, Row]] = {}
-        for row in read_rollouts(folder)[0] if (folder / ROLLOUTS).exists() else ():
+        there, metadata = read_rollouts(folder) if (folder / ROLLOUTS).exists() else ([], {})
+        self._declared = metadata.get(DECLARED)
+        for row in there:
             self._rows.setdefault(row.instance, {})[row.policy, row.repeat] = row
         self._shards = Shards(folder) if (folder / SHARDS).exists() else None
         if self._shards is not None:
@@ -33,7 +38,7 @@ class Recording:
     @property
     def complete(self) -> bool:
         """The rollout log and its contexts hold everything."""
-        return self._shards is None and not self.missing()
+        return self._shards is None and not self.missing() and self._has_skills()
 
     def missing(self) -> dict[str, list[Episode]]:
         """Episodes that are not there, by instance; an instance that lacks only its context has none."""
@@ -65,10 +70,24 @@ class Recording:
         for encoder, contexts in shards.contexts.items():
             for instance, context in contexts.items():
                 self._cache.put(encoder, instance, context)
+        if self._skills is not None:
+            for skill, examples in self._skills.examples.items():
+                self._cache.put_examples(self.encoder, skill, list(examples))
+            configuration = configuration | {DECLARED: self._able}
         self._cache.save()
         write_rollouts(self.folder, [self._rows[key][episode] for key in self.plan.instances for episode in self.plan.episodes(key)], configuration)
         shards.close(remove=True)
         self._shards = None
+
+    @property
+    def _able(self) -> dict[str, list[str]] | None:
+        """What is declared, as it lies in the log's metadata."""
+        return None if self._skills is None else {policy: list(names) for policy, names in self._skills.able.items()}
+
+    def _has_skills(self) -> bool:
+        return self._skills is None or (
+            self._declared == self._able and all(len(self._cache.examples(self.encoder, skill)) for skill in self._skills.examples)
+        )
 
     def _has_context(self, instance: str) -> bool:
         in_shards = self._shards is not None and instance in self._shards.contexts.get(self.encoder, {})

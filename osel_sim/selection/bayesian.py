@@ -13,6 +13,7 @@ from scipy.special import ndtr
 from osel_sim.errors import UnknownNameError, UsageError
 from osel_sim.selection.features import Array, Features, Sketch
 from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
 
 INTERCEPT = 0.5
 """Prior variance of a policy's mean reward, in units of the noise. Strong: no context is needed to find the best single policy."""
@@ -38,7 +39,7 @@ class BayesianSelector(SelectorBase):
 
     Model: reward + cost = centre + a_policy + w_policy . features + noise, all Gaussian. How much the context matters (the variance of w) and how
     large the noise is are learned from the evidence. Where the context does not help that variance goes to nothing, and what remains is a bandit on
-    the policies' means.
+    the policies' means. With declared skills there are two centres and two a_policy, for what a policy declares and for what it does not.
 
     A policy's score is mean + deviation * (`optimism` * sqrt(1 + log(1 + n) / 4) + `chance` * standard normal), n being how many decisions told about
     contexts like this one, and the highest score is chosen: optimism alone is UCB, chance alone Thompson sampling. The logarithm makes sure that a
@@ -54,6 +55,7 @@ class BayesianSelector(SelectorBase):
         optimism, chance: see above, >= 0.
         expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
             learned (`osel_sim.costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
+        skills: what policies are said to be able to do, as a first guess of their success; None: nothing is said.
         warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
 
     Raises:
@@ -75,8 +77,12 @@ class BayesianSelector(SelectorBase):
         chance: float,
         expected_costs: Mapping[str, float] | None,
         warm_contexts: ArrayLike | None,
+        skills: Skills | None = None,
     ) -> None:
         super().__init__(policies, context_dim, seed)
+        if skills is not None and skills.dimension != context_dim:
+            raise UsageError(f"the examples of skills have length {skills.dimension}, contexts {context_dim}")
+        self._skills = skills
         for name, value in (("optimism", optimism), ("chance", chance)):
             if not (math.isfinite(value) and value >= 0.0):
                 raise UsageError(f"{name} must be finite and >= 0, got {value}")
@@ -91,10 +97,12 @@ class BayesianSelector(SelectorBase):
         self._features = features
         self._generator = np.random.default_rng(seed)
         self._contexts: list[NDArray[np.float32]] = []
+        self._head_count = 1 if skills is None else 2
+        self._heads: list[Array] = []
         self._chosen: list[int] = []
         self._targets: list[float] = []
         self._signal, self._noise, self._next_fit = float(np.mean(self._signals)), NOISE, 2
-        # Of each policy's intercept and weights, (policies, 1 + dim) and (policies, 1 + dim, 1 + dim); the covariances relative to the noise.
+        # Of each policy's intercept(s) and weights, (policies, rows) and (policies, rows, rows); the covariances relative to the noise.
         self._means, self._covariances = np.zeros((0, 0)), np.zeros((0, 0, 0))
         self._fit()
 
@@ -107,6 +115,7 @@ class BayesianSelector(SelectorBase):
             "chance": self.chance,
             "expected_costs": self._costs_declared,
             "warm_contexts": self._warm_digest,
+            "skills": None if self._skills is None else self._skills.digest,
         }
 
     @property
@@ -115,26 +124,27 @@ class BayesianSelector(SelectorBase):
         return self._signal
 
     def _select(self, context: Context) -> Choice:
-        row = self._row(self._sketch(context))
-        variances = np.maximum((self._covariances @ row) @ row, 1e-12)
+        rows = self._rows(context, self._sketch(context))
+        variances = np.maximum(((self._covariances @ rows[:, :, None])[:, :, 0] * rows).sum(axis=1), 1e-12)
         deviations = np.sqrt(self._noise * variances)
         # 1 / variance is how many decisions, this policy's, told about contexts like this one.
         optimism = self.optimism * math.sqrt(1.0 + 0.25 * math.log1p((1.0 / variances).sum()))
-        propensities = highest(self._means @ row - self._costs + optimism * deviations, self.chance * deviations)
+        propensities = highest((self._means * rows).sum(axis=1) - self._costs + optimism * deviations, self.chance * deviations)
         index = int(self._generator.choice(len(self.policies), p=propensities))
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         sketched, index = self._sketch(context), self.policies.index(choice.policy)
+        row = self._rows(context, sketched)[index]
         target = reward + self._costs[index]
         self._contexts.append(np.array(sketched))
+        self._heads.append(row[: self._head_count].copy())
         self._chosen.append(index)
         self._targets.append(float(target))
         if len(self._targets) >= self._next_fit:
             self._fit()
             self._next_fit = math.ceil(len(self._targets) * GROWTH)
             return
-        row = self._row(sketched)
         step = self._covariances[index] @ row
         variance = 1.0 + float(step @ row)
         self._means[index] += step * ((target - self._means[index] @ row) / variance)
@@ -145,11 +155,15 @@ class BayesianSelector(SelectorBase):
         contexts = np.array(self._contexts, np.float64).reshape(-1, self._sketch.dim)
         targets, chosen = np.array(self._targets), np.array(self._chosen, np.int64)
         self._fit_features(np.concatenate([self._warm, contexts]), contexts, chosen, targets)
-        rows = np.concatenate([np.ones((len(contexts), 1)), self._features.transform(contexts)], axis=1)
-        # The mean over policies, not decisions: how good the most chosen one is says little of those hardly tried.
-        counts, sums = (np.bincount(chosen, weights, len(self._costs)) for weights in (None, targets))
-        centre = float(((sums + CENTRE) / (counts + 1)).mean())
-        targets = targets - centre
+        heads = np.array(self._heads, np.float64).reshape(-1, self._head_count)
+        rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
+        if self._skills is None:
+            # The mean over policies, not decisions: how good the most chosen one is says little of those hardly tried.
+            counts, sums = (np.bincount(chosen, weights, len(self._costs)) for weights in (None, targets))
+            prior = np.array([((sums + CENTRE) / (counts + 1)).mean()])
+        else:
+            prior = np.array([DECLARED, NOT_DECLARED])
+        targets = targets - heads @ prior
         parts = [(rows[chosen == policy], targets[chosen == policy]) for policy in range(len(self._costs))]
         moments = np.stack([part.T @ part for part, _ in parts])
         vectors = np.stack([part.T @ target for part, target in parts])
@@ -161,7 +175,7 @@ class BayesianSelector(SelectorBase):
         scale = self._scale(self._signal)
         self._covariances = scale[:, None] * np.linalg.inv(np.eye(len(scale)) + scale[:, None] * moments * scale) * scale
         self._means = (self._covariances @ vectors[..., None])[..., 0]
-        self._means[:, 0] += centre
+        self._means[:, : self._head_count] += prior
 
     def _fit_features(self, contexts: Array, own: Array, chosen: NDArray[np.int64], targets: Array) -> None:
         """Fit `features` to contexts, warm ones included; `own` are those decided on."""
@@ -181,10 +195,21 @@ class BayesianSelector(SelectorBase):
 
     def _scale(self, signal: float) -> Array:
         """Prior deviations of the intercept and the weights, relative to the noise."""
-        return np.sqrt(np.concatenate([[INTERCEPT], np.full(self._features.dim, signal)]))
+        return np.sqrt(np.concatenate([np.full(self._head_count, INTERCEPT), np.full(self._features.dim, signal)]))
 
-    def _row(self, sketched: NDArray[np.float32]) -> Array:
-        return np.concatenate([[1.0], self._features.transform(sketched[None].astype(np.float64))[0]])
+    def _rows(self, context: Context, sketched: NDArray[np.float32]) -> Array:
+        """What the regressions see of a context, (policies, 1 + dim): a constant for the intercept, and the features.
+
+        With skills (policies, 2 + dim): how far a policy declares what is asked for, and how far not, instead of the constant. Each has its own
+        intercept, so that a policy which disappoints where it promised much is not thought worse of where it promised little.
+        """
+        if self._skills is None:
+            heads = np.ones((len(self.policies), 1))
+        else:
+            share = self._skills.share(context, self.policies)
+            heads = np.stack([share, 1.0 - share], axis=1)
+        features = self._features.transform(sketched[None].astype(np.float64))
+        return np.concatenate([heads, np.repeat(features, len(heads), axis=0)], axis=1)
 
     def _cost(self, policy: str) -> float:
         if self._costs_declared is None:
@@ -211,6 +236,7 @@ class BayesianSelector(SelectorBase):
     def _state(self) -> State:
         return {
             "contexts": np.array(self._contexts, np.float32).reshape(-1, self._sketch.dim),
+            "heads": np.array(self._heads, np.float64).reshape(-1, self._head_count),
             "chosen": np.array(self._chosen, np.int64),
             "targets": np.array(self._targets, np.float64),
             "means": self._means.copy(),
@@ -221,7 +247,7 @@ class BayesianSelector(SelectorBase):
         }
 
     def _load(self, state: State) -> None:
-        self._contexts = list(state["contexts"].copy())
+        self._contexts, self._heads = list(state["contexts"].copy()), list(state["heads"].copy())
         self._chosen, self._targets = state["chosen"].tolist(), state["targets"].tolist()
         self._means, self._covariances = state["means"].copy(), state["covariances"].copy()
         self._signal, self._noise, self._next_fit = state["model"]

@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from osel_sim.errors import UsageError
 from osel_sim.selection.bayesian import BayesianSelector
 from osel_sim.selection.features import Landmarks
+from osel_sim.selection.skills import Skills
 
 
 class KernelUCBSelector(BayesianSelector):
@@ -15,18 +16,19 @@ class KernelUCBSelector(BayesianSelector):
 
     Contexts that lie together share what was learned of a policy, those apart do not, so regions of any shape can be told apart, and the selector
     begins as a bandit without context and becomes a contextual one as far as the rewards speak for it (see `BayesianSelector`). Where they
-    never do it stays with the best single policy. Declared costs spare it learning time and price; it works without, and with no
-    context seen before.
+    never do it stays with the best single policy. Declared costs spare it learning time and price, declared skills trying everything everywhere; it
+    works without, and with no context seen before.
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
         expected_costs: policy -> declared alpha_time * time + alpha_price * price, as `osel_sim.costs.expected_costs` gives; None learns them too.
+        skills: which policies declare what, as `osel_sim.skills.declare` gives it; a first guess, overruled by outcomes. None: nothing is known.
         warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
         components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
         signals, optimism, chance: see `BayesianSelector`. A little chance keeps every propensity above 0 where policies are close.
 
     Raises:
-        UsageError: a number out of range, or contexts of another form.
+        UsageError: a number out of range, or contexts (those of the skills, too) of another form.
         UnknownNameError: `expected_costs` lacks a policy.
     """
 
@@ -39,6 +41,7 @@ class KernelUCBSelector(BayesianSelector):
         seed: int,
         *,
         expected_costs: Mapping[str, float] | None = None,
+        skills: Skills | None = None,
         warm_contexts: ArrayLike | None = None,
         components: int = 32,
         whitening: float = 0.25,
@@ -61,6 +64,7 @@ class KernelUCBSelector(BayesianSelector):
             chance=chance,
             expected_costs=expected_costs,
             warm_contexts=warm_contexts,
+            skills=skills,
         )
 
     @property
