@@ -155,8 +155,8 @@ def test_training_finds_what_the_instruction_names(tmp_path: Path) -> None:
         task = world.instruction(target, world.HELD_OUT, random)
         batch = before({"observation.images.agentview": image, "observation.state": torch.from_numpy(world.state_of(gripper, 0.0)), "task": task})
         with torch.inference_mode():
-            actions, estimates, _ = policy.compute(batch)
-        places = estimates[0, 0, :, :3].numpy() * spread + centre
+            actions, scene = policy.compute(batch)
+        places = scene.fused[0, 0, :, :3].numpy() * spread + centre
         found += int((np.linalg.norm(places - positions[target], axis=1) < 0.05).all())
         approached += int(actions[0, 0, :2].numpy() @ (positions[target[0]] - gripper)[:2] > 0)
     assert found >= 36

@@ -4,4 +4,5 @@
 def register() -> None:
     """Make our policy types and processor steps known to LeRobot's factory."""
     import osel_sim.policy.language_chunk
-    import osel_sim.policy.octo_chunk  # noqa: F401
+    import osel_sim.policy.octo_chunk
+    import osel_sim.policy.perception_step  # noqa: F401

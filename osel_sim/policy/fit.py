@@ -2,7 +2,7 @@
 
 import difflib
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +18,16 @@ from osel_sim.policy.base import ACTION_DIM
 PREPROCESSOR = "policy_preprocessor.json"
 
 
-def check_fit(spec: PolicySpec, config: PreTrainedConfig, fills_environment_state: bool = False) -> None:
+def check_fit(spec: PolicySpec, config: PreTrainedConfig, seen: Collection[str] = ()) -> None:
     """Whether the policy file gives what a checkpoint wants.
 
     Args:
-        fills_environment_state: the checkpoint's own preprocessor makes `observation.environment_state`.
+        seen: images that the checkpoint's own preprocessor looks at to make `observation.environment_state`.
 
     Raises:
         CheckpointError: saying what the checkpoint wants, what the policy file gives, and what to write instead.
     """
-    problems = [*_images(spec, config), *_state(spec, config), *_action(spec, config), *_others(spec, config, fills_environment_state)]
+    problems = [*_images(spec, [*config.image_features, *seen]), *_state(spec, config), *_action(spec, config), *_others(spec, config, bool(seen))]
     if problems:
         raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} does not fit: {'; '.join(problems)}")
 
@@ -70,15 +70,16 @@ def check_processors(spec: PolicySpec, checkpoint: str) -> None:
         )
 
 
-def fills_environment_state(checkpoint: str) -> bool:
-    """Whether a local checkpoint's preprocessor has a step of ours that makes `observation.environment_state`."""
-    from osel_sim.policy.processing import TEXT_EMBEDDING
+def seen_by_processors(checkpoint: str) -> dict[str, tuple[int, ...]]:
+    """Image key -> shape of what a perception step of ours in a local checkpoint's preprocessor looks at to make `observation.environment_state`."""
+    from osel_sim.policy.perception_step import PERCEPTION
 
     try:
         steps = json.loads((Path(checkpoint) / PREPROCESSOR).read_bytes())["steps"]
-        return any(step.get("registry_name") == TEXT_EMBEDDING for step in steps)
+        configs = [step["config"] for step in steps if step.get("registry_name") == PERCEPTION]
+        return {key: (3, config["image_size"], config["image_size"]) for config in configs for key in config["mounted"]}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return False
+        return {}
 
 
 def camera_keys(mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, str]:
@@ -86,9 +87,8 @@ def camera_keys(mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, str]:
     return {mapping.key(camera): camera for camera in cameras}
 
 
-def _images(spec: PolicySpec, config: PreTrainedConfig) -> Iterator[str]:
+def _images(spec: PolicySpec, wanted: list[str]) -> Iterator[str]:
     given = camera_keys(spec.mapping, spec.cameras)
-    wanted = list(config.image_features)
     for key in sorted(set(wanted) - set(given) - set(spec.mapping.blank)):
         free = [name for name in given if name not in wanted]
         near = next(iter(difflib.get_close_matches(key, free, n=1, cutoff=0.0)), None)
@@ -96,8 +96,8 @@ def _images(spec: PolicySpec, config: PreTrainedConfig) -> Iterator[str]:
         yield f'it wants {key}, the policy file gives {", ".join(sorted(given))} ({advice}; or leave it black: [mapping] blank = ["{key}"])'
     for key in sorted((set(given) | set(spec.mapping.blank)) - set(wanted)):
         if key in spec.mapping.images.values() or key in spec.mapping.blank:
-            near = difflib.get_close_matches(key, wanted, n=1, cutoff=0.0)
-            yield f"[mapping] gives it {key}, which it does not know" + (f": did you mean {near[0]!r}?" if near else "")
+            meant = difflib.get_close_matches(key, wanted, n=1, cutoff=0.0)
+            yield f"[mapping] gives it {key}, which it does not know" + (f": did you mean {meant[0]!r}?" if meant else "")
 
 
 def _state(spec: PolicySpec, config: PreTrainedConfig) -> Iterator[str]:

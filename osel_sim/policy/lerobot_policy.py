@@ -25,7 +25,7 @@ from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.hub import offline_if_unreachable
 from osel_sim.policy import register
 from osel_sim.policy.base import Actions, Observation, Policy
-from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors, fills_environment_state
+from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors, seen_by_processors
 from osel_sim.policy.mapping import actions_of, state_of
 from osel_sim.policy.text import embed
 
@@ -48,21 +48,28 @@ def load(spec: PolicySpec) -> Callable[[], Policy]:
         register_third_party_plugins()
         config = _config(spec, checkpoint)
         config.device = device
-        check_fit(spec, config, fills_environment_state(checkpoint))
+        seen = seen_by_processors(checkpoint)
+        check_fit(spec, config, seen)
         check_processors(spec, checkpoint)
         policy, processors = _weights(spec, checkpoint, config, device)
         check_normalisation(spec, config, *processors)
-    return lambda: LeRobotPolicy(spec, policy, processors)
+    images = {**{key: tuple(feature.shape) for key, feature in config.image_features.items()}, **seen}
+    return lambda: LeRobotPolicy(spec, policy, processors, images)
 
 
 class LeRobotPolicy:
-    """One session of a LeRobot policy; made by `load`."""
+    """One session of a LeRobot policy; made by `load`.
 
-    def __init__(self, spec: PolicySpec, policy: PreTrainedPolicy, processors: tuple[Any, Any]) -> None:
+    Args:
+        images: shape (3, H, W) of every image that the policy or its preprocessor looks at.
+    """
+
+    def __init__(self, spec: PolicySpec, policy: PreTrainedPolicy, processors: tuple[Any, Any], images: dict[str, tuple[int, ...]]) -> None:
         shared = {id(tensor): tensor for tensor in chain(policy.parameters(), policy.buffers())}
         self._policy = copy.deepcopy(policy, shared)  # own queues and caches, shared weights
         self._before, self._after = copy.deepcopy(processors)
         self._mapping, self._cameras = spec.mapping, camera_keys(spec.mapping, spec.cameras)
+        self._images = images
         self._instruction, self._calls = "", 0
         self._context: Tensor | None = None
 
@@ -83,8 +90,8 @@ class LeRobotPolicy:
         """
         config = self._policy.config
         batch: dict[str, Any] = {"task": self._instruction}
-        for key, feature in config.image_features.items():
-            size = feature.shape[-2:]
+        for key, shape in self._images.items():
+            size = shape[-2:]
             batch[key] = _image(observation[f"{OBS_IMAGES}.{self._cameras[key]}"], size) if key in self._cameras else torch.zeros(3, *size)
         if config.robot_state_feature is not None:
             batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping))

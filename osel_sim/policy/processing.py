@@ -4,19 +4,16 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol
 
-import numpy as np
 import torch
 from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import TransitionKey
 from lerobot.processor import ObservationProcessorStep, PolicyAction, PolicyProcessorPipeline, ProcessorStepRegistry
 from lerobot.processor.factory import make_default_policy_processor_steps, make_policy_processor_pipelines
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_LANGUAGE_TOKENS, OBS_STATE
+from lerobot.utils.constants import OBS_IMAGES, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
 
 from osel_sim.policy.scene import OBS_ROTATION
-from osel_sim.policy.text import PIECES, embed, tokenise
-
-TEXT_EMBEDDING = "osel_sim_text_embedding"
+from osel_sim.policy.text import PIECES, tokenise
 
 Features = dict[PipelineFeatureType, dict[str, PolicyFeature]]
 
@@ -42,32 +39,6 @@ class HashedTextStep(ObservationProcessorStep):  # type: ignore[misc]
     def transform_features(self, features: Features) -> Features:
         """The features after the step."""
         features[PipelineFeatureType.OBSERVATION][OBS_LANGUAGE_TOKENS] = PolicyFeature(FeatureType.LANGUAGE, (self.length, PIECES))
-        return features
-
-
-@ProcessorStepRegistry.register(name=TEXT_EMBEDDING)
-@dataclass
-class TextEmbeddingStep(ObservationProcessorStep):  # type: ignore[misc]
-    """Sets `observation.environment_state`, float32 (batch, dimension), to a fixed embedding of the `task` strings.
-
-    Through it a policy without language, such as LeRobot's ACT, reads instructions.
-    """
-
-    dimension: int = 64
-
-    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """What the step makes of an observation."""
-        texts = _texts(self.transition)
-        observation[OBS_ENV_STATE] = torch.from_numpy(np.stack([embed(text, self.dimension) for text in texts]))
-        return observation
-
-    def get_config(self) -> dict[str, Any]:
-        """What the pipeline's JSON keeps of the step."""
-        return {"dimension": self.dimension}
-
-    def transform_features(self, features: Features) -> Features:
-        """The features after the step."""
-        features[PipelineFeatureType.OBSERVATION][OBS_ENV_STATE] = PolicyFeature(FeatureType.ENV, (self.dimension,))
         return features
 
 

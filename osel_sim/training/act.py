@@ -1,100 +1,54 @@
-"""LeRobot's ACT trained from scratch on labelled demonstrations: what it needs beside its own loss. Nothing of this is in the checkpoint.
+"""LeRobot's ACT and the perception that makes its environment state, trained together; a checkpoint keeps the second in a processor step.
 
-ACT sees instructions as a fixed embedding in its environment state. Its action loss alone teaches it that a thing is where the gripper is, so while
-training a head reads the encoder's token of the instruction and must tell where the named things are, and which patch of each image shows them.
+ACT has no language, and from a few hundred demonstrations and its action loss alone its ResNet learns that a thing is where the gripper is.
 """
 
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.utils.constants import OBS_ENV_STATE
 from torch import Tensor, nn
-from torchvision.ops.misc import FrozenBatchNorm2d  # type: ignore[import-untyped]
 
-from osel_sim.policy.grounding import grid, laplace, miss, mlp
-from osel_sim.policy.scene import ACTIVE_PLACES, ACTIVE_POSITIONS, GROUNDING_PLACES, GROUNDING_POSITIONS, IMAGE_SHIFT
-from osel_sim.training.recipe import Optimisation
-
-QUERIES = 2
-"""Roles of an instruction that are asked for; besides them, the two things that the expert is busy with."""
-INSTRUCTION_TOKEN = 2
-"""Place of the environment state among the encoder's tokens: after the latent and the robot's state."""
-ATTENTION_WEIGHT = 0.1
-VARIANCE_FLOOR = 1e-3
+from osel_sim.policy.perception import Perception
+from osel_sim.policy.scene import grounding_losses
 
 
-class LabelledACT(nn.Module):
-    """An ACT policy with a head that is asked for places; the Trainer's module.
+@dataclass
+class LabelWeights:
+    """Weights of the losses of the labels, the action loss having 1."""
+
+    grounding_weight: float
+    attention_weight: float = 0.1
+
+
+class PerceivingACT(nn.Module):
+    """Perception, then ACT.
 
     Args:
-        policy: ACT with robot state, environment state and at least one image.
+        policy: ACT with an environment state as long as the perception's vector, and no images.
     """
 
-    def __init__(self, policy: PreTrainedPolicy, settings: Optimisation) -> None:
+    def __init__(self, policy: PreTrainedPolicy, perception: Perception, weights: LabelWeights) -> None:
         super().__init__()
-        self.policy = policy
-        self._cameras = len(policy.config.image_features)
-        self._weight = settings.grounding_weight
-        width, self._slots = policy.config.dim_model, QUERIES + 2
-        self.position = mlp(width, width, 4 * self._slots)
-        self.query = nn.Linear(width, self._slots * width)
+        self.policy, self.perception, self._weights = policy, perception, weights
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """ACT's own loss and those of the labels, if the batch has them."""
-        tokens: list[Tensor] = []
-        handle = self.policy.model.encoder.register_forward_hook(lambda _module, _inputs, output: tokens.append(output))
-        try:
-            loss, report = self.policy(batch)
-        finally:
-            handle.remove()
-        report = {"action_loss": report["l1_loss"]}
-        if GROUNDING_POSITIONS not in batch or ACTIVE_POSITIONS not in batch:
-            return loss, report
-        encoded = tokens[0].float()
-        asked = encoded[INSTRUCTION_TOKEN]
-        with torch.autocast(asked.device.type, enabled=False):
-            estimate = self.position(asked).view(len(asked), self._slots, 4)
-            estimate = torch.cat([estimate[..., :3], 3 * nn.functional.softsign(estimate[..., 3:] / 3) - 1], dim=-1)
-            truth = torch.cat([batch[GROUNDING_POSITIONS][:, 0], batch[ACTIVE_POSITIONS][:, 0]], dim=1)
-            position = laplace(estimate, truth)
-            loss = loss + self._weight * position
-            report["grounding_loss"] = position.item()
-            if GROUNDING_PLACES in batch:
-                attention = self._attention(encoded, batch)
-                loss = loss + ATTENTION_WEIGHT * attention
-                report["attention_loss"] = attention.item()
-        return loss, report
+        found, scene = self.perception(batch)
+        with torch.autocast(found.device.type, enabled=False):  # bfloat16 knows places to a centimetre only
+            loss, report = self.policy({**batch, OBS_ENV_STATE: found})
+        labelled, more = grounding_losses(scene.views, scene.grounded, scene.fused, batch, self._weights)
+        return loss + labelled, {"action_loss": report["l1_loss"], **more}
 
-    def _attention(self, encoded: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        """Cross-entropy of which patch of each image shows what."""
-        asked, patches = encoded[INSTRUCTION_TOKEN], encoded[INSTRUCTION_TOKEN + 1 :].transpose(0, 1)
-        queries = self.query(asked).view(len(asked), self._slots, -1)
-        truth = torch.cat([batch[GROUNDING_PLACES][:, 0], batch[ACTIVE_PLACES][:, 0]], dim=1)
-        side = round((patches.shape[1] / self._cameras) ** 0.5)
-        places = grid(side, side, asked.device)[None] - batch[IMAGE_SHIFT][:, None]
-        losses = []
-        for camera, own in enumerate(patches.chunk(self._cameras, dim=1)):
-            log_heat = ((queries @ own.transpose(1, 2)) / own.shape[-1] ** 0.5).log_softmax(dim=-1)[:, None]
-            losses.append(miss(log_heat, places, truth[:, None, :, camera]))
-        return torch.stack(losses).mean()
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor]) -> Tensor:
+        """Chunk of actions (batch, chunk_size, action_dim), not yet postprocessed."""
+        actions: Tensor = self.policy.predict_action_chunk({**batch, OBS_ENV_STATE: self.perception(batch)[0]})
+        return actions
 
-
-@torch.no_grad()
-def calibrate(policy: PreTrainedPolicy, batch: dict[str, Tensor]) -> None:
-    """Set the statistics of the backbone's frozen batch norms from one batch.
-
-    ACT freezes them at those of ImageNet. Without a download there are none, and eighteen layers that normalise nothing hardly learn.
-    """
-
-    def adapt(module: Any, inputs: tuple[Tensor, ...]) -> None:
-        values = inputs[0].float()
-        module.running_mean.copy_(values.mean(dim=(0, 2, 3)))
-        module.running_var.copy_(values.var(dim=(0, 2, 3)).clamp_min(VARIANCE_FLOOR))
-
-    norms = [module for module in policy.model.backbone.modules() if isinstance(module, FrozenBatchNorm2d)]
-    handles = [module.register_forward_pre_hook(adapt) for module in norms]
-    try:
-        policy.model.backbone(torch.cat([batch[key] for key in policy.config.image_features]))
-    finally:
-        for handle in handles:
-            handle.remove()
+    @torch.no_grad()
+    def locate(self, batch: dict[str, Tensor]) -> Tensor:
+        """Where the things that the instruction names are thought to be: (batch, queries, 3), in the state's normalised coordinates."""
+        fused: Tensor = self.perception(batch)[1].fused
+        return fused[:, 0, :, :3]

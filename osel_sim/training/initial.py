@@ -6,12 +6,13 @@ from pathlib import Path
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import make_pre_post_processors
-from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.processor import NormalizerProcessorStep
 from safetensors.torch import load_file
+from torch import nn
 
 from osel_sim.errors import CheckpointError
 from osel_sim.policy import register
+from osel_sim.policy.perception_step import PerceptionStep
 from osel_sim.training.batches import Statistics
 
 WEIGHTS = "model.safetensors"
@@ -39,19 +40,26 @@ class Initial:
         self.statistics: Statistics = {
             key: {name: torch.as_tensor(value, dtype=torch.float32) for name, value in values.items()} for key, values in (found or [{}])[0].items()
         }
+        for step in before.steps:
+            if isinstance(step, PerceptionStep):
+                parts = {"policy": self._weights, "perception": step.state_dict()}
+                self._weights = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
         self.digest = sha256((folder / WEIGHTS).read_bytes()).hexdigest()
 
-    def fill(self, policy: PreTrainedPolicy) -> None:
-        """Give a policy the checkpoint's weights.
+    def fill(self, trainee: nn.Module, kind: str) -> None:
+        """Give a module in training the checkpoint's weights.
+
+        Args:
+            kind: the recipe's type of policy.
 
         Raises:
             CheckpointError: it has other parts, or parts of another size.
         """
-        if policy.config.type != self.config.type:
-            raise CheckpointError(f"{self.folder}: is of type {self.config.type!r}, the recipe wants {policy.config.type!r}")
-        own = policy.state_dict()
+        if kind != self.config.type:
+            raise CheckpointError(f"{self.folder}: is of type {self.config.type!r}, the recipe wants {kind!r}")
+        own = trainee.state_dict()
         for name in sorted({*own, *self._weights}):
             sizes = [tuple(state[name].shape) if name in state else None for state in (self._weights, own)]
             if sizes[0] != sizes[1]:
                 raise CheckpointError(f"{self.folder}: does not fit the recipe and the policy file: {name} is {sizes[0]} there, {sizes[1]} here")
-        policy.load_state_dict(self._weights)
+        trainee.load_state_dict(self._weights)

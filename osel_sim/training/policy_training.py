@@ -91,9 +91,9 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
     held_batches = Batches(data, held_frames, statistics, wanted, recipe.augmentation, options.seed)
     (prepare, _), (prepare_held, finish) = model.preparing(), model.preparing()
     size = recipe.optimisation.batch_size
-    trainee, policy_of = model.trainee(prepare(batches.training(0, size)))
+    trainee = model.trainee()
     if initial is not None:
-        initial.fill(policy_of(trainee))
+        initial.fill(trainee, recipe.type)
     identity = json.dumps(
         [recipe.to_dict(), [one.fingerprint for one in data], options.seed, list(spec.cameras), initial and initial.digest], sort_keys=True
     )
@@ -109,7 +109,7 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
     resumed = options.resume and trainer.resume()
     if not resumed and options.minutes is not None:
         trainer.steps = trainer.steps_in(options.minutes)
-    parameters = sum(parameter.numel() for parameter in policy_of(trainee).parameters())
+    parameters = sum(parameter.numel() for parameter in trainee.parameters())
     print(
         f"{spec.name}: {recipe.type}, {parameters / 1e6:.2f}M parameters, {len(data)} dataset(s) with {sum(map(len, frames))} frames to train on, "
         f"{trainer.steps} steps of {size} on {device}" + (f", continued at {trainer.progress.step}" if resumed else ""),
@@ -147,8 +147,8 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
         for index, (one, held) in enumerate(zip(data, held_frames, strict=True)):
             if len(held):
                 roles = list(one.annotations.roles) if one.annotations is not None else []
-                by_task[one.name] |= validate(policy_of(average), held_batches, index, len(held), roles, prepare_held, finish, spread, spec.execute)
-        model.save(policy_of(average), options.out, half=options.half)
+                by_task[one.name] |= validate(average, held_batches, index, len(held), roles, prepare_held, finish, spread, spec.execute)
+        model.save(average, options.out, half=options.half)
         if options.rollouts:
             from osel_sim.training.rollouts import success_rate
 

@@ -9,7 +9,7 @@ from osel_sim.errors import UnknownNameError
 from osel_sim.formats.validate import Table
 
 _CHUNK = {"chunk_size": (1, 200), "image_size": (16, 512)}
-_LOOKING = {
+_PERCEPTION = {
     "stem_channels": (4, 512),
     "channels": (8, 1024),
     "trunk_layers": (0, 16),
@@ -19,14 +19,14 @@ _LOOKING = {
     "text_length": (4, 256),
     "text_dim": (8, 1024),
     "text_layers": (0, 12),
-    "hidden": (16, 8192),
-    "hidden_layers": (0, 32),
 }
+_HEAD = {"hidden": (16, 8192), "hidden_layers": (0, 32)}
 MODELS: dict[str, dict[str, tuple[int, int]]] = {
-    "language_chunk": {**_CHUNK, **_LOOKING, "keypoints": (1, 512)},
+    "language_chunk": {**_CHUNK, **_PERCEPTION, **_HEAD, "keypoints": (1, 512)},
     "octo_chunk": {
         **_CHUNK,
-        **_LOOKING,
+        **_PERCEPTION,
+        **_HEAD,
         "patch": (1, 64),
         "width": (16, 4096),
         "layers": (1, 48),
@@ -37,7 +37,8 @@ MODELS: dict[str, dict[str, tuple[int, int]]] = {
     },
     "act": {
         **_CHUNK,
-        "text_dim": (8, 4096),
+        **_PERCEPTION,
+        "keypoints": (1, 512),
         "dim_model": (16, 4096),
         "n_heads": (1, 64),
         "dim_feedforward": (16, 16384),

@@ -12,10 +12,11 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from osel_sim.policy.grounding import PLACE_FEATURES, STATE_FEATURES, Grounding, TextEncoder, View
+from osel_sim.policy.grounding import TextEncoder
 from osel_sim.policy.language_chunk.configuration_language_chunk import LanguageChunkConfig
-from osel_sim.policy.language_chunk.network import ActionHead, Camera
-from osel_sim.policy.scene import ChunkQueue, action_weight, grounding_losses, look
+from osel_sim.policy.language_chunk.network import ActionHead
+from osel_sim.policy.perception import KeypointCamera, perceive, percept_size
+from osel_sim.policy.scene import ChunkQueue, Scene, action_weight, grounding_losses, look
 
 
 class LanguageChunkPolicy(ChunkQueue, PreTrainedPolicy):  # type: ignore[misc]
@@ -33,40 +34,21 @@ class LanguageChunkPolicy(ChunkQueue, PreTrainedPolicy):  # type: ignore[misc]
             raise ValueError("language_chunk needs an action feature")
         self.image_keys = list(config.image_features)
         self.text = TextEncoder(config)
-        self.cameras = nn.ModuleList(Camera(config, key.split(".")[-1] in config.mounted_cameras) for key in self.image_keys)
-        per_camera = config.queries * (PLACE_FEATURES + config.channels + 4) + 2 * config.keypoints + config.channels
-        inputs = len(self.image_keys) * per_camera + STATE_FEATURES + config.text_dim + config.queries * 7
-        self.head = ActionHead(inputs, config.hidden, config.hidden_layers, config.chunk_size, action.shape[0])
+        self.cameras = nn.ModuleList(KeypointCamera(config, key.split(".")[-1] in config.mounted_cameras) for key in self.image_keys)
+        self.head = ActionHead(percept_size(config, len(self.image_keys)), config.hidden, config.hidden_layers, config.chunk_size, action.shape[0])
         self.reset()
 
-    def compute(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor, list[tuple[View, Grounding]]]:
-        """The network.
-
-        Returns:
-            actions (batch, chunk, action_dim); fused position estimates (batch, 1 + pairs, queries, 4), the last of the four being the
-            logarithm of the expected error; and what each camera saw and found.
-        """
-        scene = look(self.text, self.cameras, self.image_keys, batch)
-        cameras = [camera for camera in self.cameras if isinstance(camera, Camera)]
-        pairs = zip(cameras, scene.raw, scene.views, strict=True)
-        points = [camera.keypoints(raw, view.places, scene.sentence) for camera, raw, view in pairs]
-        state, fused = scene.state, scene.fused
-        with torch.autocast(state.device.type, enabled=False):
-            own = fused[:, 0]
-            parts = [state, scene.sentence, own.flatten(1), (own[..., :3] - state[:, None, :3]).flatten(1)]
-            for grounding in scene.grounded:
-                parts += [part[:, 0].flatten(1) for part in (grounding.found, grounding.attended, grounding.estimate)]
-            for keypoints, mean in points:
-                parts += [keypoints, mean]
-            actions = self.head(torch.cat(parts, dim=-1))
-        return actions, fused, list(zip(scene.views, scene.grounded, strict=True))
+    def compute(self, batch: dict[str, Tensor]) -> tuple[Tensor, Scene]:
+        """The network: actions (batch, chunk, action_dim), and what was seen."""
+        found, scene = perceive(self.text, self.cameras, self.image_keys, batch)
+        with torch.autocast(found.device.type, enabled=False):
+            return self.head(found), scene
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float] | None]:
         """Loss: L1 of the actions not beyond the episode's end, plus those of the labelled positions and places, if there are any."""
-        actions, fused, cameras = self.compute(batch)
+        actions, scene = self.compute(batch)
         action_loss = ((actions - batch[ACTION]).abs() * action_weight(batch, actions, self.config.gripper_weight)).sum()
-        views, grounded = [view for view, _ in cameras], [grounding for _, grounding in cameras]
-        labelled, report = grounding_losses(views, grounded, fused, batch, self.config)
+        labelled, report = grounding_losses(scene.views, scene.grounded, scene.fused, batch, self.config)
         return action_loss + labelled, {"action_loss": action_loss.item(), **report}
 
     @torch.no_grad()
