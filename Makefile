@@ -9,6 +9,8 @@ ARGS ?=
 ONE_THREAD := OMP_NUM_THREADS=1
 
 SHORT := open_drawer close_drawer press_button door pick_place lift stack push nut_assembly
+EPISODES ?= 240
+INSTANCES ?= 50
 POLICIES := local_small remote_specialist remote_base remote_large
 
 .PHONY: run test slow lint bench policies wheel requirements environment clean
@@ -31,15 +33,16 @@ bench: $(READY)
 	$(PYTHON) benchmarks/simulation.py $(ARGS)
 
 # From nothing to the checkpoints in assets/policies and what they can do: demonstrations, training, measurement. Interrupted, it goes on where it was.
+# To see all of it happen in a few minutes, in a clone of which you need nothing: make policies EPISODES=8 INSTANCES=1 ARGS="--steps 30"
 policies: $(READY)
-	$(PYTHON) -m osel_sim.collect --task $(SHORT) --episodes 240 --level 0 1 2 --out data/suite --resume
-	$(PYTHON) -m osel_sim.collect --task tidy --episodes 120 --level 0 1 2 --out data/suite/tidy --resume
-	$(PYTHON) -m osel_sim.collect --task sort --episodes 60 --level 0 1 2 --out data/suite/sort --resume
+	$(PYTHON) -m osel_sim.collect --task $(SHORT) --episodes $(EPISODES) --level 0 1 2 --out data/suite --resume
+	$(PYTHON) -m osel_sim.collect --task tidy --episodes $$(( $(EPISODES) / 2 )) --level 0 1 2 --out data/suite/tidy --resume
+	$(PYTHON) -m osel_sim.collect --task sort --episodes $$(( $(EPISODES) / 4 )) --level 0 1 2 --out data/suite/sort --resume
 	for policy in $(POLICIES); do \
 		$(PYTHON) -m osel_sim.train --policy $$policy --data data/suite --out runs/train/$$policy --half --resume $(ARGS) && \
 		mkdir -p assets/policies/$$policy && cp runs/train/$$policy/*.json runs/train/$$policy/*.safetensors assets/policies/$$policy/ || exit 1; \
 	done
-	$(PYTHON) -m osel_sim.record --task all --level 0 2 --policies $(POLICIES) --instances 50 --repeats 3 --repeat-every 10 --action-noise 0.05 --out runs/suite $$([ ! -f runs/suite/run.json ] || echo --resume)
+	$(PYTHON) -m osel_sim.record --task all --level 0 2 --policies $(POLICIES) --instances $(INSTANCES) --repeats 3 --repeat-every 10 --action-noise 0.05 --out runs/suite $$([ ! -f runs/suite/run.json ] || echo --resume)
 
 wheel: $(READY)
 	$(PYTHON) -m build --no-isolation

@@ -57,9 +57,11 @@ def style_of(names: Sequence[str], policies: Sequence[str], always: Mapping[str,
     """
     oracles = set(ORACLES.values())
     of_policy = colours(policies)
-    own = colours([*policies, *(name for name in names if name not in always and name not in oracles)])
-    colour = {name: "ink" if name in oracles else of_policy[always[name]] if name in always else own[name] for name in names}
     shown = names if len(names) <= _FEW else [name for name in names if name in MAIN or name in keep or name == ORACLES["hindsight"]]
+    # Those shown first: colours repeat, and two that are seen together must not share one.
+    others = sorted((name for name in names if name not in always and name not in oracles), key=lambda name: name not in shown)
+    own = colours([*policies, *others])
+    colour = {name: "ink" if name in oracles else of_policy[always[name]] if name in always else own[name] for name in names}
     return Style(colour, frozenset(shown))
 
 
