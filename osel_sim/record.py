@@ -114,7 +114,7 @@ def _record(options: argparse.Namespace) -> int:
     known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
     check_folder(folder, known, options.resume)
     encoder = load_encoder(encoder_name)
-    skills = declare(policies, encoder, options.tasks)
+    skills = declare(policies, encoder, tasks, options.tasks)
     configuration["encoder"] = encoder.identity
     known["encoder"] = before.get("configuration", {}).get("encoder") if before and added_encoder else encoder.identity
     ran_with = environment(choose_backend(), content.root())

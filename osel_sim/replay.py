@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from osel_sim.selection.reward import RewardWeights
 
 COSTS, SKILLS = "expected_costs", "skills"
-"""Setting of selectors that take what policies cost from what is declared of them, rather than learn it."""
+"""Settings of selectors that take what policies cost, and what they were made for, from what is declared of them, rather than learn it."""
 
 EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/pick_place                                   # every selector there is, 20 seeds
@@ -95,6 +95,7 @@ def _replay(
 ) -> None:
     """Replay, write and print."""
     from osel_sim.formats.replay_result import write_replay
+    from osel_sim.formats.rollout_log import DECLARED
     from osel_sim.offline.beforehand import Beforehand
     from osel_sim.offline.oracles import oracles
     from osel_sim.offline.result import build, tables, with_fixed
@@ -111,6 +112,12 @@ def _replay(
     log, left_out = complete_instances(log, weights)
     if left_out.instances:
         print(f"warning: {left_out.instances} instances without an outcome of every policy are left out", file=sys.stderr)
+    if log.skills is None and log.metadata.get(DECLARED) and not options.unknown_skills:
+        print(
+            f"warning: auto is not told what policies were made for: {log.source} lacks examples of it in the contexts of {log.encoder}; "
+            f"python -m osel_sim.record --resume --out {log.source} --encoder {log.encoder.partition('@')[0]} adds them",
+            file=sys.stderr,
+        )
     best = oracles(log, weights)
     beforehand = Beforehand(others.contexts, others.rewards(weights)) if options.half else None
     choices = with_fixed(_replay_all(log, weights, selectors, costs, options, beforehand), best)

@@ -127,6 +127,8 @@ def _run(options: argparse.Namespace) -> int:
     # The last bits of a matrix product depend on the number of threads; one, so that a run does not depend on how many there are.
     torch.set_num_threads(1)
     known = _declared(options.selector, tasks, policies, weights, encoder, options.tasks)
+    if "skills" in known:
+        configuration["skills"] = known["skills"].digest if known["skills"] is not None else None
     selector = make_selector(options.selector, [spec.name for spec in policies], encoder.dimension, options.seed, **known)
     print(f"{_title(tasks)}: loading {', '.join(spec.name for spec in everyone)}, starting servers ...", file=sys.stderr)
     with contextlib.ExitStack() as stack:
@@ -261,7 +263,7 @@ def _declared(
         actions = sum(task.horizon for task in tasks) // (2 * len(tasks))
         known["expected_costs"] = expected_costs(policies, weights, max(1, actions))
     if "skills" in wanted:
-        known["skills"] = declare(policies, encoder, extra)
+        known["skills"] = declare(policies, encoder, tasks, extra)
     return known
 
 

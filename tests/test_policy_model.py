@@ -18,9 +18,10 @@ from osel_sim import content
 from osel_sim.errors import CheckpointError
 from osel_sim.formats.mapping import Mapping
 from osel_sim.policy.language_chunk import LanguageChunkConfig, LanguageChunkPolicy, make_language_chunk_pre_post_processors
-from osel_sim.policy.lerobot_policy import load, threads
+from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.processing import area_weights, rotation_columns
 from osel_sim.policy.text import PADDING, embed, tokenise
+from osel_sim.threads import threads
 from osel_sim.training.recipe import find_recipe, load_recipe
 
 SIZE = 32
@@ -218,7 +219,10 @@ def test_wrong_state_and_action_dimensions_are_refused(tmp_path: Path) -> None:
     shapes = features(("agentview",))
     shapes["input_features"][OBS_STATE] = PolicyFeature(FeatureType.STATE, (14,))
     shapes["output_features"][ACTION] = PolicyFeature(FeatureType.ACTION, (14,))
-    ACTConfig(**shapes, pretrained_backbone_weights=None)._save_pretrained(tmp_path)
+    config = ACTConfig(**shapes, pretrained_backbone_weights=None)
+    config._save_pretrained(tmp_path)
+    for pipeline in make_pre_post_processors(config):
+        pipeline.save_pretrained(tmp_path)
     with pytest.raises(CheckpointError, match=r"shape \(14,\), the simulation gives \(8,\).*shape \(14,\), the robot takes \(7,\)"):
         load(spec_of(tmp_path))
 

@@ -125,7 +125,7 @@ def test_a_warm_start_spares_the_beginning(tmp_path: Path, log):
     assert result["selectors"]["linucb:warm"]["kind"] == "learner" and result["selectors"]["linucb:warm"]["decisions_until_ahead"] < 30
 
 
-def test_auto_is_told_what_the_log_says_of_its_policies(tmp_path: Path):
+def test_auto_is_told_what_the_log_says_of_its_policies(tmp_path: Path, capsys):
     """Two kinds of instances, each the business of one policy, and examples of both in the log."""
     chance = np.random.default_rng(0)
     centres, rows, contexts = {"dig": np.eye(1, 8)[0], "fly": -np.eye(1, 8)[0]}, [], {}
@@ -142,6 +142,9 @@ def test_auto_is_told_what_the_log_says_of_its_policies(tmp_path: Path):
         ahead[name] = result["selectors"]["auto"]["decisions_until_ahead"]
         assert result["skills"] == (None if flags else {"dig": ["dig"], "fly": ["fly"]})
     assert ahead["told"] == 1 < ahead["untold"]
+    write_rollouts(folder, rows, {"encoder": "made_up@1", "skills": {"dig": ["dive"]}})
+    assert run(folder, "--selectors", "random", "--seeds", 1, "--out", tmp_path / "lacking", *FREE) == 0
+    assert "record --resume --out" in capsys.readouterr().err
     write_rollouts(folder, rows, {"encoder": "made_up@1", "skills": "dig"})
     with pytest.raises(DataError, match="skills in its metadata must be an object of lists of names, got 'dig'"):
         read_log(folder)

@@ -9,7 +9,7 @@ import pytest
 
 from osel_sim import content
 from osel_sim.context.encoder import load_encoder
-from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.errors import ContentError, DataError, UsageError
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.skills import UNKNOWN, Skills
 from osel_sim.sim.instance import make_instance
@@ -55,6 +55,8 @@ def test_wrong_skills_are_refused():
         Skills({"a": np.zeros((2, 3), np.float32), "b": np.zeros((2, 4), np.float32)}, {})
     with pytest.raises(UsageError, match="one length"):
         Skills({}, {})
+    with pytest.raises(UsageError, match="finite"):
+        Skills({"a": np.full((2, 3), np.nan, np.float32)}, {})
     with pytest.raises(UsageError, match=r"'first' declares kind9, of which there are no examples"):
         skills({"first": ("kind9",)})
     with pytest.raises(UsageError, match=r"skills have length 16, contexts 17"):
@@ -110,11 +112,12 @@ def test_the_file_has_the_first_word_and_the_checkpoint_the_second(tmp_path: Pat
     spec = content.load_policy("remote_specialist")
     assert declared_skills(spec) == ("close_drawer", "door", "open_drawer", "press_button", "push")
     assert declared_skills(replace(spec, skills=("push", "tag:long"))) == ("push", "sort", "tidy")
-    with pytest.raises(UnknownNameError, match="did you mean 'push'"):
+    with pytest.raises(ContentError, match=r"remote_specialist\.toml: skills: .*did you mean 'push'"):
         declared_skills(replace(spec, skills=("pusch",)))
     own = replace(spec, checkpoint=str(tmp_path))
     assert declared_skills(own) is None
-    for text, expected in (("{}", None), ("not json", None), (json.dumps({"datasets": [{"task": "lift"}, {"task": "mine"}]}), ("lift",))):
+    trained = json.dumps({"datasets": [{"task": name} for name in ("lift", "mine", "lift")]})
+    for text, expected in (("{}", None), ("not json", None), (trained, ("lift",))):
         (tmp_path / "training.json").write_text(text)
         assert declared_skills(own) == expected
     assert declared_skills(replace(spec, checkpoint="somebody/something")) is None
@@ -123,7 +126,7 @@ def test_the_file_has_the_first_word_and_the_checkpoint_the_second(tmp_path: Pat
 def test_what_the_shipped_policies_declare_is_found_in_unseen_words():
     encoder = load_encoder("osel_suite")
     names = ("remote_specialist", "remote_base")
-    told = declare([content.load_policy(name) for name in names], encoder)
+    told = declare([content.load_policy(name) for name in names], encoder, content.select_tasks(["sort"]))
     assert told is not None and set(told.able) == set(names) and {len(contexts) for contexts in told.examples.values()} == {EXAMPLES}
     picture = np.full((96, 96, 3), 200, np.uint8)
     wide = {
@@ -138,4 +141,7 @@ def test_what_the_shipped_policies_declare_is_found_in_unseen_words():
             instance = make_instance(content.select_tasks([task])[0], seed, 2, "test")
             shares = dict(zip(names, told.share(encoder.encode([picture], instance.instruction), names), strict=True))
             assert max(shares, key=shares.__getitem__) == policy, instance.instruction
-    assert declare([replace(content.load_policy("local_small"), checkpoint="")], encoder) is None
+    for seed in range(4):  # nobody declares it: it is not taken for the nearest that somebody does
+        instance = make_instance(content.select_tasks(["sort"])[0], seed, 2, "test")
+        assert told.share(encoder.encode([picture], instance.instruction), names).tolist() == [0.0, 0.0]
+    assert declare([replace(content.load_policy("local_small"), checkpoint="")], encoder, ()) is None

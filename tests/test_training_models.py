@@ -13,7 +13,7 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from safetensors.torch import load_file
 
 from osel_sim import content
-from osel_sim.errors import CheckpointError, ContentError, DataError, UnknownNameError
+from osel_sim.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
 from osel_sim.policy import register
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.training.annotations import load_annotations
@@ -147,6 +147,11 @@ def test_what_acts_perception_looks_at_must_be_given(tmp_path: Path, demonstrati
     spec = replace(content.load_policy("local_small"), checkpoint=str(tmp_path / "out"), cameras=("wrist",))
     with pytest.raises(CheckpointError, match=r"it wants observation\.images\.agentview, the policy file gives observation\.images\.wrist"):
         load(spec)
+
+
+def test_sizes_that_do_not_fit_are_one_line(tmp_path: Path, demonstrations: Path) -> None:
+    with pytest.raises(UsageError, match=r"remote_large\.toml: the sizes of the model do not fit each other: .*num_heads"):
+        run("act", tmp_path / "out", [demonstrations], 1, changes={"model": SIZES["act"] | {"n_heads": 3}})
 
 
 def test_act_and_its_perception_begin_with_a_checkpoint(tmp_path: Path, demonstrations: Path) -> None:

@@ -1,6 +1,5 @@
 """Contexts on disk: `contexts.npz` beside a journal or rollout log, keyed by encoder and instance."""
 
-import itertools
 import os
 import zipfile
 from collections.abc import Callable, Sequence
@@ -12,6 +11,8 @@ from osel_sim.context.encoder import Context, Encoder, Image
 from osel_sim.errors import DataError, UsageError
 
 FILE = "contexts.npz"
+EXAMPLE = "skill:"
+"""How the keys of examples of skills begin; an instance's begins with the name of its task."""
 
 
 class ContextCache:
@@ -58,12 +59,20 @@ class ContextCache:
 
     def examples(self, encoder: str, skill: str) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
         """Contexts (n, d) of the examples of a skill, in order; (0, 0) if there are none."""
+        known, found = self._contexts.get(self._identity(encoder), {}), list[Context]()
+        while _example(skill, len(found)) in known:
+            found.append(known[_example(skill, len(found))])
+        return np.stack(found) if found else np.zeros((0, 0), np.float32)
+
+    def skills(self, encoder: str) -> list[str]:
+        """Names of the skills that have examples here, sorted."""
         known = self._contexts.get(self._identity(encoder), {})
-        found = list(itertools.takewhile(lambda context: context is not None, (known.get(_example(skill, row)) for row in itertools.count())))
-        return np.stack([context for context in found if context is not None]) if found else np.zeros((0, 0), np.float32)
+        return sorted({key.split(":")[1] for key in known if key.startswith(EXAMPLE)})
 
     def put_examples(self, encoder: str, skill: str, contexts: Sequence[Context]) -> None:
-        """Add the examples of a skill."""
+        """Set the examples of a skill."""
+        for row in range(len(self.examples(encoder, skill))):
+            del self._contexts[encoder][_example(skill, row)]
         for row, context in enumerate(contexts):
             self.put(encoder, _example(skill, row), context)
 
@@ -115,7 +124,7 @@ class ContextCache:
 
 
 def _example(skill: str, row: int) -> str:
-    return f"skill:{skill}:{row}"
+    return f"{EXAMPLE}{skill}:{row}"
 
 
 def _read(file: Path) -> dict[str, dict[str, Context]]:

@@ -228,7 +228,7 @@ def read_contexts(folder: Path, instances: Sequence[str], encoder: str | None) -
 
 
 def read_skills(folder: Path, encoder: str, declared: Any) -> Skills | None:
-    """What a log's policies declared, with the examples that lie among its contexts; None where it does not say, or has none of this encoder.
+    """What a log's policies declared, with the examples that lie among its contexts; None where it does not say, or lacks examples of this encoder.
 
     Args:
         encoder: identity.
@@ -246,8 +246,8 @@ def read_skills(folder: Path, encoder: str, declared: Any) -> Skills | None:
     ):
         raise DataError(f"{folder / ROLLOUTS}: {DECLARED} in its metadata must be an object of lists of names, got {declared!r}")
     cache = ContextCache(folder)
-    examples = {name: cache.examples(encoder, name) for name in sorted({name for names in declared.values() for name in names})}
-    if not examples or any(not len(contexts) for contexts in examples.values()):
+    examples = {name: cache.examples(encoder, name) for name in cache.skills(encoder)}
+    if not examples or not {name for names in declared.values() for name in names} <= set(examples):
         return None
     return Skills(examples, {policy: tuple(names) for policy, names in declared.items()})
 

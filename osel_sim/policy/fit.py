@@ -1,7 +1,6 @@
 """Whether a LeRobot checkpoint and a policy file fit together, said before anything runs."""
 
 import difflib
-import json
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -68,18 +67,6 @@ def check_processors(spec: PolicySpec, checkpoint: str) -> None:
             f"{spec.file}: checkpoint {spec.checkpoint!r} has no {PREPROCESSOR}: it was saved without its processors, or before LeRobot 0.4; "
             f"python -m lerobot.processor.migrate_policy_normalization --pretrained-path {checkpoint} makes them"
         )
-
-
-def seen_by_processors(checkpoint: str) -> dict[str, tuple[int, ...]]:
-    """Image key -> shape of what a perception step of ours in a local checkpoint's preprocessor looks at to make `observation.environment_state`."""
-    from osel_sim.policy.perception_step import PERCEPTION
-
-    try:
-        steps = json.loads((Path(checkpoint) / PREPROCESSOR).read_bytes())["steps"]
-        configs = [step["config"] for step in steps if step.get("registry_name") == PERCEPTION]
-        return {key: (3, config["image_size"], config["image_size"]) for config in configs for key in config["mounted"]}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}
 
 
 def camera_keys(mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, str]:

@@ -25,12 +25,11 @@ from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.hub import offline_if_unreachable
 from osel_sim.policy import register
 from osel_sim.policy.base import Actions, Observation, Policy
-from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors, seen_by_processors
+from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors
 from osel_sim.policy.mapping import actions_of, state_of
+from osel_sim.policy.perception_step import PerceptionStep
 from osel_sim.policy.text import embed
-
-THREADS = 1
-"""Threads of one inference. Sums are split differently among another number of threads, so their last bits would depend on the machine."""
+from osel_sim.threads import threads
 
 
 def load(spec: PolicySpec) -> Callable[[], Policy]:
@@ -48,10 +47,11 @@ def load(spec: PolicySpec) -> Callable[[], Policy]:
         register_third_party_plugins()
         config = _config(spec, checkpoint)
         config.device = device
-        seen = seen_by_processors(checkpoint)
-        check_fit(spec, config, seen)
         check_processors(spec, checkpoint)
-        policy, processors = _weights(spec, checkpoint, config, device)
+        processors = _processors(spec, checkpoint, config, device)
+        seen = {key: shape for step in processors[0].steps if isinstance(step, PerceptionStep) for key, shape in step.image_shapes.items()}
+        check_fit(spec, config, seen)
+        policy = _weights(spec, checkpoint, config)
         check_normalisation(spec, config, *processors)
     images = {**{key: tuple(feature.shape) for key, feature in config.image_features.items()}, **seen}
     return lambda: LeRobotPolicy(spec, policy, processors, images)
@@ -65,9 +65,9 @@ class LeRobotPolicy:
     """
 
     def __init__(self, spec: PolicySpec, policy: PreTrainedPolicy, processors: tuple[Any, Any], images: dict[str, tuple[int, ...]]) -> None:
-        shared = {id(tensor): tensor for tensor in chain(policy.parameters(), policy.buffers())}
-        self._policy = copy.deepcopy(policy, shared)  # own queues and caches, shared weights
-        self._before, self._after = copy.deepcopy(processors)
+        eyes = [step.perception.parameters() for step in processors[0].steps if isinstance(step, PerceptionStep)]
+        shared = {id(tensor): tensor for tensor in chain(policy.parameters(), policy.buffers(), *eyes)}
+        self._policy, self._before, self._after = copy.deepcopy((policy, *processors), shared)  # own queues and caches, shared weights
         self._mapping, self._cameras = spec.mapping, camera_keys(spec.mapping, spec.cameras)
         self._images = images
         self._instruction, self._calls = "", 0
@@ -97,7 +97,7 @@ class LeRobotPolicy:
             batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping))
         if self._context is not None:
             batch[OBS_ENV_STATE] = self._context
-        with torch.inference_mode(), threads(THREADS), drawing(self._instruction, self._calls):
+        with torch.inference_mode(), threads(1), drawing(self._instruction, self._calls):
             prepared = {key: value for key, value in self._before(batch).items() if isinstance(value, Tensor)}
             # the postprocessor knows single actions (batch, 7): a chunk's steps take the batch's place
             stepwise = (config.n_obs_steps or 1) > 1
@@ -119,17 +119,24 @@ def _config(spec: PolicySpec, checkpoint: str) -> PreTrainedConfig:
         raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} cannot be read: {_line(error)}") from error
 
 
-def _weights(spec: PolicySpec, checkpoint: str, config: PreTrainedConfig, device: str) -> tuple[PreTrainedPolicy, tuple[Any, Any]]:
+def _processors(spec: PolicySpec, checkpoint: str, config: PreTrainedConfig, device: str) -> tuple[Any, Any]:
+    try:
+        overrides = {"device_processor": {"device": device}}
+        before, after = make_pre_post_processors(config, checkpoint, preprocessor_overrides=overrides, postprocessor_overrides={})
+    except Exception as error:
+        raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} of type {config.type!r} cannot be loaded: {_line(error)}") from error
+    return before, after
+
+
+def _weights(spec: PolicySpec, checkpoint: str, config: PreTrainedConfig) -> PreTrainedPolicy:
     try:
         policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config, strict=True)
-        overrides = {"device_processor": {"device": device}}
-        processors = make_pre_post_processors(config, checkpoint, preprocessor_overrides=overrides, postprocessor_overrides={})
     except Exception as error:
         raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} of type {config.type!r} cannot be loaded: {_line(error)}") from error
     policy.eval()
     for parameter in policy.parameters():
         parameter.requires_grad_(False)
-    return policy, processors
+    return policy
 
 
 def _line(error: Exception) -> str:
@@ -165,16 +172,3 @@ def drawing(instruction: str, call: int) -> Iterator[None]:
     with torch.random.fork_rng(devices=[torch.cuda.current_device()] if torch.cuda.is_available() else []):
         torch.manual_seed(zlib.crc32(instruction.encode()) + call)
         yield
-
-
-@contextlib.contextmanager
-def threads(count: int) -> Iterator[None]:
-    """Compute with so many threads for a while."""
-    before = torch.get_num_threads()
-    if before != count:
-        torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        if before != count:
-            torch.set_num_threads(before)

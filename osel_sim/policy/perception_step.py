@@ -39,6 +39,11 @@ class PerceptionStep(ObservationProcessorStep):  # type: ignore[misc]
         with torch.random.fork_rng(devices=[]):  # the weights come from the file: making room for them must not move anyone's random numbers
             self.perception = Perception(PerceptionConfig(**self.sizes), self.mounted).eval().requires_grad_(False)
 
+    @property
+    def image_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Image key -> shape (3, H, W) of what it looks at."""
+        return dict.fromkeys(self.mounted, (3, self.image_size, self.image_size))
+
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """What the step makes of an observation."""
         observation[OBS_ENV_STATE] = self.perception.to(observation[OBS_STATE].device)(observation)[0]

@@ -85,9 +85,8 @@ class Recording:
         return None if self._skills is None else {policy: list(names) for policy, names in self._skills.able.items()}
 
     def _has_skills(self) -> bool:
-        return self._skills is None or (
-            self._declared == self._able and all(len(self._cache.examples(self.encoder, skill)) for skill in self._skills.examples)
-        )
+        there = self._cache.skills(self.encoder)
+        return self._declared == self._able and (self._skills is None or set(self._skills.examples) <= set(there))
 
     def _has_context(self, instance: str) -> bool:
         in_shards = self._shards is not None and instance in self._shards.contexts.get(self.encoder, {})

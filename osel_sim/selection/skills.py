@@ -32,7 +32,7 @@ class Skills:
         able: policy -> the skills that it declares. Policies that are not in it declare nothing.
 
     Raises:
-        UsageError: no skill, one without examples, examples of different length, or a policy declares a skill that has none.
+        UsageError: no skill, one without examples, examples of different length or not finite, or a policy declares a skill that has none.
     """
 
     examples: Mapping[str, NDArray[np.float32]]
@@ -42,6 +42,8 @@ class Skills:
         shapes = {name: np.shape(contexts) for name, contexts in self.examples.items()}
         if not shapes or any(len(shape) != 2 or shape[0] < 1 or shape[1] != next(iter(shapes.values()))[1] for shape in shapes.values()):
             raise UsageError(f"skills need examples (n, D) of one length D, got shapes {shapes}")
+        if not all(np.isfinite(contexts).all() for contexts in self.examples.values()):
+            raise UsageError("examples of skills must be finite")
         for policy, names in self.able.items():
             if not set(names) <= set(shapes):
                 raise UsageError(f"policy {policy!r} declares {', '.join(sorted(set(names) - set(shapes)))}, of which there are no examples")

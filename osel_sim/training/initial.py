@@ -44,7 +44,7 @@ class Initial:
             if isinstance(step, PerceptionStep):
                 parts = {"policy": self._weights, "perception": step.state_dict()}
                 self._weights = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        self.digest = sha256((folder / WEIGHTS).read_bytes()).hexdigest()
+        self.digest = sha256(b"".join(file.read_bytes() for file in sorted(folder.glob("*.safetensors")))).hexdigest()
 
     def fill(self, trainee: nn.Module, kind: str) -> None:
         """Give a module in training the checkpoint's weights.

@@ -48,8 +48,15 @@ class Model:
     perception: PerceptionStep | None = None
 
     def trainee(self) -> nn.Module:
-        """A module with fresh weights, in torch's current random state: its forward gives the loss; it predicts action chunks and locates things."""
-        module: Any = get_policy_class(self.config.type)(self.config)
+        """A module with fresh weights, in torch's current random state: its forward gives the loss; it predicts action chunks and locates things.
+
+        Raises:
+            UsageError: sizes of the recipe do not fit each other, which only the layers themselves know.
+        """
+        try:
+            module: Any = get_policy_class(self.config.type)(self.config)
+        except (ValueError, AssertionError) as error:
+            raise UsageError(f"{self.recipe.file}: the sizes of the model do not fit each other: {' '.join(str(error).split())}") from None
         if self.perception is not None:
             seeing = Perception(PerceptionConfig(**self.perception.sizes), self.perception.mounted)
             module = PerceivingACT(module, seeing, LabelWeights(self.recipe.optimisation.grounding_weight))

@@ -46,12 +46,16 @@ MODELS: dict[str, dict[str, tuple[int, int]]] = {
         "n_decoder_layers": (1, 48),
     },
 }
-"""Types of models, and for each the sizes a recipe may set: key -> (lowest, highest). Defaults are those of the type's configuration."""
+"""Types of models, and for each the sizes a recipe may set: key -> (lowest, highest). Defaults are those of the type's configuration
+(ACT's perception: of PerceptionConfig)."""
 
 
 @dataclass(frozen=True)
 class Optimisation:
-    """AdamW with warm-up, cosine decay, gradient clipping and an exponential moving average (EMA) of the weights, which is what is saved."""
+    """AdamW with warm-up, cosine decay, gradient clipping and an exponential moving average (EMA) of the weights, which is what is saved.
+
+    ACT's own loss counts all numbers of an action alike: `gripper_weight` is the others'.
+    """
 
     steps: int = 8000
     batch_size: int = 64
