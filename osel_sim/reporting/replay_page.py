@@ -185,6 +185,8 @@ def _facts(folder: Path, result: Mapping[str, Any], log: LoggedOutcomes, weights
     own = [("replay", str(folder)), ("seeds", str(len(result["seeds"]))), ("decisions a seed", f"{result['decisions']:,}")]
     own += [("instances left out", f"{left_out:,} without an outcome of every policy")] if left_out else []
     own += [("half of the instances", str(result["log"]["half"]))] if result["log"].get("half") else []
+    told = [("what policies cost", result.get("expected_costs")), ("what they were made for", result.get("skills"))]
+    own += [("told to auto beforehand", ", ".join(what for what, known in told if known is not None) or "nothing")]
     return [*own, ("preset", str(result["reward"].get("preset"))), *log_facts(log, weights)]
 
 
