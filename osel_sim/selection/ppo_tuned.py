@@ -16,8 +16,8 @@ class TunedPPOSelector(PPOSelector):
     """stable-baselines3's PPO as in `PPOSelector`, on leading components, with one small layer, longer rollouts and a larger learning rate.
 
     The paper's settings see contexts as the encoder gives them and take steps so small that hundreds of decisions change little. Here the network
-    sees the leading principal components of the contexts so far, half whitened. The numbers were chosen on synthetic streams and on the choosing half of
-    `assets/logs/suite`.
+    sees the leading principal components of the contexts so far, half whitened. The numbers were chosen on synthetic streams and on the choosing
+    half of `assets/logs/suite`.
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
