@@ -167,12 +167,12 @@ def _replay_all(
     from tqdm import tqdm  # type: ignore[import-untyped]
 
     from osel_sim.offline.engine import replay
-    from osel_sim.selection.registry import setting_names
+    from osel_sim.selection.registry import wanted_of
 
     known: dict[str, Any] = {COSTS: costs} if costs is not None and set(costs) == set(log.policies) else {}
     if log.skills is not None and not options.unknown_skills:
         known[SKILLS] = log.skills
-    told = {name: {key: value for key, value in known.items() if key in setting_names(name)} for name in selectors}
+    told = {name: wanted_of(name, known) for name in selectors}
     decisions = len(log) if options.decisions is None else options.decisions
     with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
         return replay(log, weights, selectors, range(options.seeds), options.decisions, options.workers, told, bar.update, beforehand)

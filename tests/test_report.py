@@ -20,6 +20,7 @@ from osel_sim.reporting.description import Bars, Column, Figure, Heat, Line, Pan
 from osel_sim.reporting.episodes import MOST_EPISODES, list_episodes
 from osel_sim.reporting.matplotlib_figures import to_images
 from osel_sim.reporting.plotly_figures import to_plotly
+from osel_sim.reporting.selector_sections import MAIN, style_of
 from osel_sim.reporting.tables import to_csv, to_text
 from osel_sim.runtime.tensorboard import check_installed
 
@@ -243,3 +244,11 @@ def test_tensorboard_is_optional(monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorboard", None)
     with pytest.raises(UsageError, match=r"pip install 'osel-sim\[tensorboard\]'"):
         check_installed()
+
+
+def test_selectors_shown_together_differ_in_colour():
+    """More of them than there are colours, as in a replay of all; those shown are the first and the last."""
+    names = [*MAIN[1:], *(f"other_{number}" for number in range(9)), MAIN[0]]
+    style = style_of(names, ("one", "two", "three", "four"), {})
+    shown = [style.colour[name] for name in names if name in style.shown]
+    assert len(shown) == len(MAIN) == len(set(shown))

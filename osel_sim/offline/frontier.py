@@ -72,7 +72,7 @@ def selector_frontier(log: LoggedOutcomes, weights: RewardWeights, selector: str
         seeds: streams at each weight; of 1,000 decisions at most.
     """
     from osel_sim.offline.engine import replay
-    from osel_sim.selection.registry import setting_names
+    from osel_sim.selection.registry import wanted_of
 
     swept = np.concatenate([[0.0], np.geomspace(high / 300, high, _REPLAYED - 1)])
     decisions = min(len(log), 1_000)
@@ -81,8 +81,7 @@ def selector_frontier(log: LoggedOutcomes, weights: RewardWeights, selector: str
     for value in swept:
         here = moved(weights, sweep, float(value))
         known: dict[str, Any] = {"skills": log.skills} | ({"expected_costs": log.expected_costs(here)} if told else {})
-        settings = {selector: {name: value for name, value in known.items() if name in setting_names(selector)}}
-        choices = replay(log, here, [selector], range(seeds), decisions, settings=settings)
+        choices = replay(log, here, [selector], range(seeds), decisions, settings={selector: wanted_of(selector, known)})
         found.append([_mean(choices.received(selector, table)[:, late]) for table in (log.success, log.seconds, log.price)])
     success, seconds, price = np.array(found).T
     return Frontier(selector, swept, success, seconds, price)

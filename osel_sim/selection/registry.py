@@ -1,7 +1,7 @@
 """Selectors by name. Listing them imports none: torch and stable-baselines3 come in with the selector that needs them."""
 
 import inspect
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, cast
@@ -73,6 +73,16 @@ def setting_names(name: str) -> list[str]:
         UnknownNameError: no such selector.
     """
     return _settings(_find(name))
+
+
+def wanted_of(name: str, known: Mapping[str, Any]) -> dict[str, Any]:
+    """What of the settings that are known a selector takes.
+
+    Raises:
+        UnknownNameError: no such selector.
+    """
+    takes = setting_names(name)
+    return {key: value for key, value in known.items() if key in takes}
 
 
 def learns_off_policy(name: str) -> bool:
