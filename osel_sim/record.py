@@ -18,14 +18,14 @@ EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine
   python -m osel_sim.record --resume --out logs/mine                                       # go on after an interruption
   python -m osel_sim.record --resume --out logs/mine --policies another                    # record one more policy on the same instances
-  python -m osel_sim.record --resume --out logs/mine --encoder ViT-L-14:openai             # add contexts of another encoder
+  python -m osel_sim.record --resume --out logs/mine --encoder ViT-L-14:openai             # read the log with another encoder from now on
   python -m osel_sim.record --task pick_place --instances 50 --repeats 4 --workers 8 --policies local_small --out logs/small
   python -m osel_sim.record --task all --instances 300 --level 0 1 2 3 --repeats 3 --repeat-every 10 --out logs/suite
   python -m osel_sim.record --summary logs/mine                                            # print the tables of a log again
 
 Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.npz. Every policy starts from the same state of the same instance. The
 files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies and an encoder
-given with it are added to what is there."""
+given with it are added to what is there, and the log is read with the encoder given last."""
 
 
 @cli.main
@@ -127,7 +127,8 @@ def _record(options: argparse.Namespace) -> int:
         if before is not None:
             write_json(folder / RUN, before | {"configuration": configuration})
         try:
-            _record_missing(recording, options.workers)
+            if recording.missing():
+                _record_missing(recording, options.workers)
         except OselError:
             if not recording.grew:  # nothing came of it, such as for want of a checkpoint: the folder is as it was
                 (folder / RUN).unlink() if before is None else write_json(folder / RUN, before)

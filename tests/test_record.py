@@ -118,6 +118,13 @@ def test_contexts_of_another_encoder_are_added(world, reference):
     assert np.array_equal(new.table("colours", keys), old.table("colours", keys))
     assert len(np.unique(new.table("osel_small", keys), axis=0)) == INSTANCES
     assert read_log(folder).encoder == metadata["encoder"]
+    back = execute(
+        world, "record", *SIZE, "--out", folder, "--resume", "--encoder", "colours"
+    )  # which is there already: the log is read with it again
+    assert back.returncode == 0, back.stderr
+    assert read_log(folder).encoder == "colours" and read_rollouts(folder)[0] == rows
+    assert json.loads((folder / "run.json").read_text())["configuration"]["encoder"] == "colours"
+    assert np.array_equal(ContextCache(folder).table("osel_small", keys), new.table("osel_small", keys))
 
 
 def test_a_log_knows_what_its_policies_declare(world, reference):

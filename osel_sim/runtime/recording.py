@@ -27,7 +27,7 @@ class Recording:
         self._cache = ContextCache(folder, autosave=0)
         self._rows: dict[str, dict[Episode, Row]] = {}
         there, metadata = read_rollouts(folder) if (folder / ROLLOUTS).exists() else ([], {})
-        self._declared = metadata.get(DECLARED)
+        self._declared, self._default = metadata.get(DECLARED), metadata.get("encoder")
         for row in there:
             self._rows.setdefault(row.instance, {})[row.policy, row.repeat] = row
         self._shards = Shards(folder) if (folder / SHARDS).exists() else None
@@ -37,8 +37,8 @@ class Recording:
 
     @property
     def complete(self) -> bool:
-        """The rollout log and its contexts hold everything."""
-        return self._shards is None and not self.missing() and self._has_skills()
+        """The rollout log and its contexts hold everything, and the contexts it is read with are this encoder's."""
+        return self._shards is None and self._default == self.encoder and not self.missing() and self._has_skills()
 
     def missing(self) -> dict[str, list[Episode]]:
         """Episodes that are not there, by instance; an instance that lacks only its context has none."""
