@@ -134,6 +134,44 @@ def test_instructions_keep_their_names_whatever_else_changes(demonstrations: Pat
         assert "put" not in text.split()
 
 
+def test_inserted_words_make_instructions_long_and_change_nothing_in_them(demonstrations: Path) -> None:
+    data = load_demonstrations(demonstrations, ("agentview",), progress=False)
+    assert data.annotations is not None
+    random, none = np.random.default_rng(0), {"drop_word": 0.0, "noise_word": 0.0}
+    target = data.annotations.target[0]
+    plain = Instructions(data.annotations, Augmentation(**none))
+    phrasings = {plain.phrase(target, random) for _ in range(300)}
+    longest = max(len(text.split()) for text in phrasings)
+    instructions = Instructions(data.annotations, Augmentation(insert_words=12, **none))
+    lengths = []
+    for _ in range(100):
+        words = instructions.phrase(target, random).split()
+        lengths.append(len(words))
+        assert any(_is_within(text.split(), words) for text in phrasings), words
+    assert longest < max(lengths) <= longest + 12
+
+
+def test_words_are_shuffled_only_where_their_order_says_nothing(demonstrations: Path) -> None:
+    data = load_demonstrations(demonstrations, ("agentview",), progress=False)
+    annotations = data.annotations
+    assert annotations is not None
+    pair = np.array([next(i for i, thing in enumerate(annotations.entities) if thing.kind == kind) for kind in annotations.roles.values()])
+    first, second = (annotations.entities[index].names for index in pair)
+    of_two_kinds = replace(annotations, phrasings=("put {object} into {container}",))
+    of_one_kind = replace(of_two_kinds, roles=dict.fromkeys(annotations.roles, "object"))
+    for labels, orders in ((of_two_kinds, {True, False}), (of_one_kind, {True})):
+        random, instructions = np.random.default_rng(0), Instructions(labels, Augmentation(shuffle_words=1.0))
+        texts = [instructions.phrase(pair, random) for _ in range(50)]
+        assert {max(map(text.find, first)) < max(map(text.find, second)) for text in texts} == orders
+        assert all(max(map(text.find, names)) >= 0 for text in texts for names in (first, second))
+
+
+def _is_within(part: list[str], words: list[str]) -> bool:
+    """Whether these words are among those, in this order."""
+    rest = iter(words)
+    return all(word in rest for word in part)
+
+
 @pytest.mark.slow
 def test_training_finds_what_the_instruction_names(tmp_path: Path) -> None:
     """600 small steps: the named square is found to a few centimetres on unseen scenes, also in words never trained on."""

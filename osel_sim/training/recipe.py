@@ -81,6 +81,12 @@ class Augmentation:
         rephrase: share of samples whose instruction is replaced by another training phrasing of the same targets.
         drop_word, noise_word: share of a phrasing's words (never of a name) left out, or replaced by a made-up word, so that words never
             seen in training are no reason to fail.
+        insert_words: up to so many words, made up or of the dataset's phrasings, are put in between those of a phrasing. Without them nothing
+            is learned about places in a text beyond the longest phrasing, and long instructions fail whatever they say.
+        shuffle_words: share of phrasings whose words come in random order, where the things named are of different kinds; where they are of
+            one kind, order is meaning.
+
+    The changes of words are those of Wei & Zou (2019), "EDA: Easy Data Augmentation", without its thesaurus.
     """
 
     shift: int = 4
@@ -92,6 +98,8 @@ class Augmentation:
     rephrase: float = 0.8
     drop_word: float = 0.15
     noise_word: float = 0.15
+    insert_words: int = 0
+    shuffle_words: float = 0.0
 
 
 @dataclass(frozen=True)
