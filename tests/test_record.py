@@ -118,9 +118,8 @@ def test_contexts_of_another_encoder_are_added(world, reference):
     assert np.array_equal(new.table("colours", keys), old.table("colours", keys))
     assert len(np.unique(new.table("osel_small", keys), axis=0)) == INSTANCES
     assert read_log(folder).encoder == metadata["encoder"]
-    back = execute(
-        world, "record", *SIZE, "--out", folder, "--resume", "--encoder", "colours"
-    )  # which is there already: the log is read with it again
+    # The first one's are there already; given again, it is the one that the log is read with.
+    back = execute(world, "record", *SIZE, "--out", folder, "--resume", "--encoder", "colours")
     assert back.returncode == 0, back.stderr
     assert read_log(folder).encoder == "colours" and read_rollouts(folder)[0] == rows
     assert json.loads((folder / "run.json").read_text())["configuration"]["encoder"] == "colours"

@@ -30,6 +30,7 @@ class Instructions:
         choices = [self._nameable[index].names if index >= 0 else ("",) for index in target]
         names = {role: known[random.integers(len(known))] for role, known in zip(self._roles, choices, strict=True)}
         words = [self._word(word, names, random) for word in self._phrasings[random.integers(len(self._phrasings))]]
+        # What is off draws no number, so that recipes without it train to the weights they always did.
         if self._augmentation.shuffle_words and not self._ordered and random.random() < self._augmentation.shuffle_words:
             random.shuffle(words)
         if self._augmentation.insert_words:
