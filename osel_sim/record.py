@@ -18,14 +18,15 @@ EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine
   python -m osel_sim.record --resume --out logs/mine                                       # go on after an interruption
   python -m osel_sim.record --resume --out logs/mine --policies another                    # record one more policy on the same instances
+  python -m osel_sim.record --resume --out logs/mine --repeats 3 --repeat-every 5          # for a surer expected oracle
   python -m osel_sim.record --resume --out logs/mine --encoder ViT-L-14:openai             # read the log with another encoder from now on
   python -m osel_sim.record --task pick_place --instances 50 --repeats 4 --workers 8 --policies local_small --out logs/small
   python -m osel_sim.record --task all --instances 300 --level 0 1 2 3 --repeats 3 --repeat-every 10 --out logs/suite
   python -m osel_sim.record --summary logs/mine                                            # print the tables of a log again
 
 Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.npz. Every policy starts from the same state of the same instance. The
-files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies and an encoder
-given with it are added to what is there, and the log is read with the encoder given last."""
+files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies, more
+repeats and an encoder given with it are added to what is there, and the log is read with the encoder given last."""
 
 
 @cli.main
@@ -44,8 +45,8 @@ def parser() -> cli.Parser:
     add = result.add_argument
     add("--task", nargs="+", default=[], metavar="NAME", help="which tasks: names, tag:TAG, or all")
     add("--instances", type=cli.positive_int, default=200, metavar="N", help="number of instances of each task (default: %(default)s)")
-    add("--repeats", type=cli.positive_int, default=1, metavar="R", help="episodes of each policy on an instance (default: %(default)s)")
-    add("--repeat-every", type=cli.positive_int, default=1, metavar="K", help="repeat on one in K instances of each level only (default: on all)")
+    add("--repeats", type=cli.positive_int, metavar="R", help="episodes of each policy on an instance (default: 1)")
+    add("--repeat-every", type=cli.positive_int, metavar="K", help="repeat on one in K instances of each level only (default: on all)")
     add("--workers", type=cli.positive_int, default=2, metavar="W", help="processes (default: %(default)s)")
     add("--policies", nargs="+", metavar="NAME", help="policies to run (default: all there are)")
     add("--level", type=cli.non_negative_int, nargs="+", default=[0], help="how hard scenes are perturbed, 0 to 3; several take turns (default: 0)")
@@ -55,7 +56,7 @@ def parser() -> cli.Parser:
     add("--start-seed", type=cli.non_negative_int, default=0, metavar="S", help="seed of the first instance (default: %(default)s)")
     add("--encoder", metavar="NAME", help="osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
     add("--out", type=Path, metavar="DIR", help="where to write")
-    add("--resume", action="store_true", help="go on with the recording in --out, or add policies or an encoder's contexts to it")
+    add("--resume", action="store_true", help="go on with the recording in --out, or add policies, repeats or an encoder's contexts to it")
     add("--summary", type=cli.folder, metavar="DIR", help="print the tables of the log in DIR, and leave")
     add("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
     add("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
@@ -76,6 +77,7 @@ def _record(options: argparse.Namespace) -> int:
     if options.resume and not options.task and options.out is not None:
         check_folder(options.out, {}, resume=True)
         _take_settings(options, read_json(options.out / RUN).get("configuration", {}))
+    options.repeats, options.repeat_every = options.repeats or 1, options.repeat_every or 1
     tasks = content.select_tasks(options.task, options.tasks)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
@@ -139,14 +141,16 @@ def _record(options: argparse.Namespace) -> int:
 
 
 def _take_settings(options: argparse.Namespace, configuration: dict[str, Any]) -> None:
-    """Set the options to those that a recording began with; policies and encoder that were given come in addition."""
+    """Set the options to those that a recording began with; policies, repeats and encoder that were given come in addition."""
     try:
         options.task = configuration["tasks"]
         options.level = configuration["levels"]
         options.axis = [part for axes in configuration["axes"] for part in axes.split(",")]
         options.policies = list(dict.fromkeys([*configuration["policies"], *(options.policies or [])]))
         options.encoder = options.encoder or configuration["encoder"].partition("@")[0]
-        for name in ("instances", "start_seed", "repeats", "repeat_every", "action_noise", "split"):
+        for name in ("repeats", "repeat_every"):
+            setattr(options, name, getattr(options, name) or configuration[name])
+        for name in ("instances", "start_seed", "action_noise", "split"):
             setattr(options, name, configuration[name])
     except KeyError as missing:
         raise DataError(
@@ -155,7 +159,7 @@ def _take_settings(options: argparse.Namespace, configuration: dict[str, Any]) -
 
 
 def _as_it_began(configuration: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """The configuration as it would have been without the policies that a recording is given later on.
+    """The configuration as it would have been without the policies and the repeats that a recording is given later on.
 
     Args:
         before: what the recording began with.
@@ -166,6 +170,11 @@ def _as_it_began(configuration: dict[str, Any], before: dict[str, Any]) -> dict[
     if added and set(policies) < set(configuration["policies"]):
         digests = {key: value for key, value in configuration["content"].items() if key in content_then or key.partition(" ")[2] not in added}
         known |= {"policies": policies, "content": digests}
+    repeats, every = before.get("repeats", 1), before.get("repeat_every", 1)
+    if configuration["repeats"] >= repeats and (
+        repeats == 1 or every % configuration["repeat_every"] == 0
+    ):  # every episode there was is still asked for
+        known |= {"repeats": repeats, "repeat_every": every}
     return known
 
 

@@ -4,7 +4,7 @@ import math
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from osel_sim.errors import UsageError
 
@@ -38,7 +38,31 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> In
     return low, high
 
 
-def bootstrap_mean_interval(values: ArrayLike, seed: int = 0, resamples: int = 10_000, confidence: float = 0.95) -> Interval:
+RESAMPLES = 10_000
+"""How often values are drawn anew for a bootstrap interval, unless said otherwise."""
+
+
+def bootstrap_means(values: ArrayLike, seed: int = 0, resamples: int = RESAMPLES) -> NDArray[np.float64]:
+    """Means of the values drawn anew with replacement, (resamples,). The same seed draws the same.
+
+    Args:
+        values: at least one finite number.
+
+    Raises:
+        UsageError: no values, or one that is not finite.
+    """
+    sample = np.asarray(values, np.float64).ravel()
+    if not sample.size or not np.isfinite(sample).all():
+        raise UsageError(f"the mean of {sample.size} values needs at least one, all finite")
+    generator = np.random.default_rng(seed)
+    # A slice at a time, so that many values do not become a table of gigabytes; its size does not change the numbers drawn.
+    rows = max(1, 1_000_000 // sample.size)
+    return np.concatenate(
+        [sample[generator.integers(sample.size, size=(min(rows, resamples - done), sample.size))].mean(axis=1) for done in range(0, resamples, rows)]
+    )
+
+
+def bootstrap_mean_interval(values: ArrayLike, seed: int = 0, resamples: int = RESAMPLES, confidence: float = 0.95) -> Interval:
     """Percentile bootstrap interval of a mean. The same seed gives the same interval.
 
     Args:
@@ -50,17 +74,8 @@ def bootstrap_mean_interval(values: ArrayLike, seed: int = 0, resamples: int = 1
     Raises:
         UsageError: no values, or one that is not finite.
     """
-    sample = np.asarray(values, np.float64).ravel()
-    if not sample.size or not np.isfinite(sample).all():
-        raise UsageError(f"the mean of {sample.size} values needs at least one, all finite")
     tail = (1.0 - _checked(confidence)) / 2.0
-    generator = np.random.default_rng(seed)
-    # A slice at a time, so that many values do not become a table of gigabytes; its size does not change the numbers drawn.
-    rows = max(1, 1_000_000 // sample.size)
-    means = [
-        sample[generator.integers(sample.size, size=(min(rows, resamples - done), sample.size))].mean(axis=1) for done in range(0, resamples, rows)
-    ]
-    low, high = np.quantile(np.concatenate(means), [tail, 1.0 - tail])
+    low, high = np.quantile(bootstrap_means(values, seed, resamples), [tail, 1.0 - tail])
     return float(low), float(high)
 
 

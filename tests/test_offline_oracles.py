@@ -1,5 +1,6 @@
 """Oracles and bounds on problems with known answers."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,12 @@ from synthetic_log import clusters, make_row, write_log
 
 from osel_sim.errors import DataError, UsageError
 from osel_sim.offline.log import read_log
+from osel_sim.offline.measures import Curves, gap_closed
 from osel_sim.offline.oracles import expected_oracle, oracles
 from osel_sim.offline.sequential import advantage_bounds
 from osel_sim.offline.streams import complete_instances, draw_streams
 from osel_sim.selection.reward import RewardWeights
+from osel_sim.statistics import RESAMPLES
 
 FREE = RewardWeights(0.0, 0.0)
 
@@ -34,20 +37,43 @@ def test_order_and_truth(tmp_path: Path):
 def test_luck_is_not_foresight():
     coins = (np.random.default_rng(0).random((4000, 2, 2)) < 0.5).astype(float)
     assert coins[:, :, 0].max(axis=1).mean() > 0.7
-    assert expected_oracle(coins).mean() == pytest.approx(0.5, abs=0.03)
-    assert expected_oracle(coins[:, :, :1]) is None
+    value, _ = expected_oracle(coins, np.zeros(4000))
+    assert value.mean() == pytest.approx(0.5, abs=0.03)
+    assert expected_oracle(coins[:, :, :1], np.zeros(4000)) is None
 
 
 def test_repeats_on_a_tenth_stand_for_all():
+    """Whatever the reference, the mean is near that with repeats everywhere; a good one makes it surer, and the spread of the gains says how sure."""
     generator = np.random.default_rng(4)
     rates = generator.choice([0.1, 0.9], (6000, 2))
     rewards = (generator.random((6000, 2, 4)) < rates[:, :, None]).astype(float)
-    full = expected_oracle(rewards)
-    rewards[np.arange(6000) % 10 > 0, :, 1:] = np.nan
-    few = expected_oracle(rewards)
-    best = np.nanmean(rewards, axis=2).mean(axis=0).max()
-    assert full.mean() - best > 0.15
-    assert few.mean() == pytest.approx(full.mean(), abs=0.04)
+    truth = expected_oracle(rewards, np.zeros(6000))[0].mean()
+    assert truth - rewards.mean(axis=(0, 2)).max() > 0.15
+    references = {"poor": rewards[:, 0, 0], "good": rates.max(axis=1)}
+    estimates = {name: [] for name in references}
+    for _ in range(100):
+        some = np.where((generator.random(6000) < 0.1)[:, None, None] | (np.arange(4) == 0), rewards, np.nan)
+        for name, reference in references.items():
+            value, gains = expected_oracle(some, reference)
+            estimates[name].append((value.mean(), gains.std() / len(gains) ** 0.5))
+    spread = {}
+    for name, found in estimates.items():
+        means, errors = np.transpose(found)
+        assert means.mean() == pytest.approx(truth, abs=0.005)
+        assert errors.mean() == pytest.approx(means.std(), rel=0.3)
+        spread[name] = means.std()
+    assert spread["good"] < 0.7 * spread["poor"]
+
+
+def test_the_interval_of_the_gap_closed_counts_what_the_oracle_may_be_off():
+    flat = np.zeros((5, 40))
+    sure = Curves({"x": flat + 0.5}, {"best_single": flat, "expected": flat + 1.0}, "expected", 30, np.zeros(RESAMPLES))
+    unsure = replace(sure, expected_errors=np.random.default_rng(0).normal(0.0, 0.1, RESAMPLES))
+    assert gap_closed(sure.selectors["x"], sure, "expected", 0) == (0.5, (0.5, 0.5))
+    share, (low, high) = gap_closed(unsure.selectors["x"], unsure, "expected", 0)
+    assert share == 0.5 and (low, high) == pytest.approx((0.5 / 1.196, 0.5 / 0.804), rel=0.02)
+    assert unsure.interval("expected", flat + 1.0) == pytest.approx((0.804, 1.196), rel=0.02)
+    assert unsure.interval("best_single", flat) == (0.0, 0.0)
 
 
 def test_groups_that_tell_nothing_are_not_used(tmp_path: Path):

@@ -42,6 +42,13 @@ def files(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in ("rollouts.parquet", "contexts.npz")}
 
 
+def resume(world: Path, folder: Path, *flags: object) -> subprocess.CompletedProcess[str]:
+    """`record --resume` with the settings of the folder and these flags."""
+    places = ["--resume", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--out", folder]
+    arguments = [*command(world, "record")[:3], *map(str, [*places, *flags])]
+    return subprocess.run(arguments, env=environment(world), capture_output=True, text=True, check=False)
+
+
 def test_repeats_are_of_all_levels():
     task, policy = load_task_file(content.find("tasks", "lift")), content.load_policy("local_small")
     plan = Plan((task,), (policy,), (policy,), range(40), (0, 2), "test", "osel_small", repeats=3, repeat_every=10)
@@ -97,12 +104,27 @@ def test_a_policy_added_to_a_log_or_to_half_a_recording_gives_the_bytes_of_all_a
     assert execute(world, "record", *first, "--resume").returncode == 0
     assert {row.policy for row in read_rollouts(folder)[0]} == {"calm"}
     assert execute(world, "record", *both, "--out", half, "--resume").returncode == 0
-    short = ["--resume", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--policies", "wild", "--out", folder]
-    done = subprocess.run([*command(world, "record")[:3], *map(str, short)], env=environment(world), capture_output=True, text=True, check=False)
+    done = resume(world, folder, "--policies", "wild")
     assert done.returncode == 0, done.stderr
     for place in (folder, half):
         assert files(place) == files(reference[0])
         assert json.loads((place / "run.json").read_text())["configuration"] == json.loads((reference[0] / "run.json").read_text())["configuration"]
+
+
+def test_repeats_added_to_a_log_give_the_bytes_of_all_at_once(world, reference):
+    folder = world / "repeated"
+    assert execute(world, "record", "--instances", INSTANCES, "--start-seed", 40, "--out", folder).returncode == 0
+    done = resume(world, folder, "--repeats", REPEATS, "--repeat-every", 2)
+    assert done.returncode == 0, done.stderr
+    some = {(row.instance, row.repeat) for row in read_rollouts(folder)[0]}
+    assert len(some) == INSTANCES + (INSTANCES + 1) // 2 * (REPEATS - 1)
+    assert resume(world, folder, "--repeat-every", 1).returncode == 0
+    assert files(folder) == files(reference[0])
+    assert json.loads((folder / "run.json").read_text())["configuration"] == json.loads((reference[0] / "run.json").read_text())["configuration"]
+    fewer = resume(world, folder, "--repeats", 1)
+    assert fewer.returncode == 2 and f"repeats was {REPEATS} at the beginning, now it is 1" in fewer.stderr
+    assert resume(world, folder, "--repeat-every", 2).returncode == 2
+    assert files(folder) == files(reference[0])
 
 
 def test_contexts_of_another_encoder_are_added(world, reference):

@@ -10,9 +10,8 @@ from osel_sim.formats.replay_result import Choices
 from osel_sim.offline.log import Array, LoggedOutcomes
 from osel_sim.offline.oracles import Oracles
 from osel_sim.selection.reward import RewardWeights
-from osel_sim.statistics import Interval, bootstrap_mean_interval
+from osel_sim.statistics import RESAMPLES, Interval, bootstrap_mean_interval, bootstrap_means
 
-RESAMPLES = 10_000
 LATE = 0.25
 """The share of a stream's decisions that counts as late."""
 
@@ -26,12 +25,24 @@ class Curves:
         oracles: hindsight, expected (where there are repeats), predictable, per_task, best_single -> reward.
         learnable: which oracle bounds what can be learned.
         late: first decision of the late part.
+        expected_errors: how far the mean of the expected oracle may be off, as it was measured on the instances with repeats: bootstrap draws,
+            (RESAMPLES,); zeros without repeats.
     """
 
     selectors: dict[str, Array]
     oracles: dict[str, Array]
     learnable: str
     late: int
+    expected_errors: Array
+
+    def errors(self, oracle: str) -> Array:
+        """How far the mean of an oracle may be off, (RESAMPLES,): only the expected one is an estimate."""
+        return self.expected_errors if oracle == "expected" else np.zeros(RESAMPLES)
+
+    def interval(self, oracle: str, values: Array) -> Interval:
+        """95 % bootstrap interval of the mean of values (S, T) that an oracle's rewards went into: over seeds and what the oracle may be off."""
+        low, high = np.quantile(bootstrap_means(values.mean(axis=1)) + self.errors(oracle), [0.025, 0.975])
+        return float(low), float(high)
 
 
 def curves(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: Oracles) -> Curves:
@@ -53,7 +64,9 @@ def curves(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: 
     }
     decisions = choices.order.shape[1]
     received = {name: choices.received(name, table) for name in choices.chosen}
-    return Curves(received, found, best.learnable, decisions - max(1, int(decisions * LATE)))
+    gains = best.expected_gains
+    errors = bootstrap_means(gains, seed=1) - gains.mean() if len(gains) else np.zeros(RESAMPLES)  # another seed than that of the streams' resampling
+    return Curves(received, found, best.learnable, decisions - max(1, int(decisions * LATE)), errors)
 
 
 def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -> dict[str, Any]:
@@ -81,14 +94,15 @@ def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -
         **_gap_entries("predictable_gap_closed", gap_closed(received, rewards, "predictable", 0)),
         **_gap_entries("predictable_gap_closed_late", gap_closed(received, rewards, "predictable", rewards.late)),
         "regret": {oracle: float((values - received).mean()) for oracle, values in rewards.oracles.items()},
-        "regret_ci95": {oracle: list(bootstrap_mean_interval((values - received).mean(axis=1))) for oracle, values in rewards.oracles.items()},
+        "regret_ci95": {oracle: list(rewards.interval(oracle, values - received)) for oracle, values in rewards.oracles.items()},
         "decisions_until_ahead": until_ahead(received - rewards.oracles["best_single"]),
         "decisions_until_better": until_better(received - rewards.oracles["best_single"]),
     }
 
 
 def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tuple[float, Interval] | None:
-    """Share of the gap to an oracle closed from decision `first` on, with its 95 % bootstrap interval over seeds.
+    """Share of the gap to an oracle closed from decision `first` on, with its 95 % bootstrap interval over seeds and, for the expected oracle, over
+    the instances with repeats that it was measured on.
 
     (selector - best single) / (oracle - best single), all averaged over seeds and decisions. None where the oracle is not better than the best
     single policy, so that there is no gap to close.
@@ -100,7 +114,7 @@ def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tup
         return None
     generator = np.random.default_rng(0)
     rows = generator.integers(len(gains), size=(RESAMPLES, len(gains)))
-    below = gaps[rows].mean(axis=1)
+    below = gaps[rows].mean(axis=1) + rewards.errors(oracle)
     shares = np.where(below > 0.0, gains[rows].mean(axis=1) / np.where(below > 0.0, below, 1.0), np.nan)
     if not np.isfinite(shares).all():
         return None

@@ -29,6 +29,7 @@ class Oracles:
     Attributes:
         best_single, worst_single: columns of the policies with the highest and the lowest mean reward over all instances.
         expected: (N,) reward of the policy that was best on the same instance in other repeats, an estimate where it has none; None without repeats.
+        expected_gains: what it has over `predictable` on each of the instances with repeats; the mean of `expected` is as sure as theirs.
         predictable: (N,) reward of the policy that was best on *other* instances of the same group (by task, target, container, phrasing).
         grouping: the attributes it went by, for each half of the instances (`first`, `second`) it was scored on.
         per_task: column of the policy with the highest mean reward on each instance's task, (N,).
@@ -37,6 +38,7 @@ class Oracles:
     best_single: int
     worst_single: int
     expected: Array | None
+    expected_gains: Array
     predictable: Array
     grouping: dict[str, tuple[str, ...]]
     per_task: NDArray[np.int64]
@@ -55,18 +57,24 @@ def oracles(log: LoggedOutcomes, weights: RewardWeights) -> Oracles:
         raise DataError(f"{log.source}: oracles need an outcome of every policy on every instance")
     predictable, grouping = predictable_oracle(log, means)
     overall = means.mean(axis=0)
-    return Oracles(int(overall.argmax()), int(overall.argmin()), expected_oracle(rewards), predictable, grouping, per_task(log, means))
+    expected, gains = expected_oracle(rewards, predictable) or (None, np.zeros(0))
+    return Oracles(int(overall.argmax()), int(overall.argmin()), expected, gains, predictable, grouping, per_task(log, means))
 
 
-def expected_oracle(rewards: Array) -> Array | None:
-    """Best policy by its mean over one half of an instance's repeats, scored by its mean over the other half; mean of both ways round, (N,).
+def expected_oracle(rewards: Array, reference: Array) -> tuple[Array, Array] | None:
+    """Best policy by its mean over one half of an instance's repeats, scored by its mean over the other half; mean of both ways round.
 
     Chosen and scored on the same outcomes, luck would count as foresight. An instance on which some policy has a single repeat only cannot be split:
-    it gets the reward of the policy that is best overall and, on top, the mean gain over that policy of those that can be. So the mean is that of
-    the repeated instances, which have to be a fair sample of all. None if no instance can be split.
+    it gets the reference and, on top, the mean gain over the reference of those that can be, which have to be a fair sample of all. That is the
+    difference estimator of survey sampling (Cochran, Sampling Techniques, 1977, chapter 7): without bias whatever the reference, and the less it
+    depends on which instances were repeated, the nearer the reference comes to the oracle.
 
     Args:
         rewards: (N, P, R), NaN where there is no outcome.
+        reference: (N,) reward of some other way to choose on every instance, such as `predictable_oracle`.
+
+    Returns:
+        reward on every instance, (N,), and the gains over the reference of the instances that can be split; None if none can.
     """
     known = np.isfinite(rewards)
     number = np.cumsum(known, axis=2) - 1  # the how-manieth valid repeat each is
@@ -74,15 +82,13 @@ def expected_oracle(rewards: Array) -> Array | None:
     splits = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
     if not splits.any():
         return None
-    means = mean_over_repeats(rewards)
-    best = means[:, int(means.mean(axis=0).argmax())]
     rows = np.flatnonzero(splits)
     one = second[rows, first[rows].argmax(axis=1)]
     other = first[rows, second[rows].argmax(axis=1)]
-    gain = (one + other) / 2.0 - best[rows]
-    value = best + gain.mean()
-    value[rows] = best[rows] + gain
-    return value
+    gains = (one + other) / 2.0 - reference[rows]
+    value = reference + gains.mean()
+    value[rows] = reference[rows] + gains
+    return value, gains
 
 
 def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[str, tuple[str, ...]]]:

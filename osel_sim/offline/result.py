@@ -13,7 +13,6 @@ from osel_sim.offline.oracles import Oracles
 from osel_sim.offline.streams import LeftOut
 from osel_sim.offline.verdict import reward_span, verdict
 from osel_sim.selection.reward import RewardWeights
-from osel_sim.statistics import bootstrap_mean_interval
 
 BEST, WORST = "best_single", "worst_single"
 REFERENCES = (BEST, WORST)
@@ -65,12 +64,16 @@ def build(
         "oracles": {
             name: {
                 "mean_reward": float(values.mean()),
-                "ci95": list(bootstrap_mean_interval(values.mean(axis=1))),
+                "ci95": list(rewards.interval(name, values)),
                 "mean_reward_late": float(values[:, rewards.late :].mean()),
             }
             for name, values in rewards.oracles.items()
         },
-        "learnable_oracle": {"name": rewards.learnable, "grouping": {half: list(names) for half, names in best.grouping.items()}},
+        "learnable_oracle": {
+            "name": rewards.learnable,
+            "repeated": len(best.expected_gains),
+            "grouping": {half: list(names) for half, names in best.grouping.items()},
+        },
         "paired": paired(rewards, [*learners, *(name for name, entry in selectors.items() if entry["kind"] == "random"), BEST]),
         "verdict": verdict(rewards, learners, selectors, policies[best.best_single], reward_span(log.rewards(weights))),
     }

@@ -162,7 +162,7 @@ def gap_figure(gaps: Mapping[str, tuple[Estimate | None, Estimate | None]], orac
             continue
         values, low, high = ([100 * getattr(estimate, end) for _, estimate in found] for end in ("value", "low", "high"))
         marks.append(Bars(label, [name for name, _ in found], values, colour, low, high))
-    caption = f"0% is the best single policy, 100% the {oracle}. With 95% intervals over seeds."
+    caption = f"0% is the best single policy, 100% the {oracle}. With 95% intervals over seeds and over what the expected oracle may be off."
     caption += " A selector that sees more than an oracle by groups can pass it."
     return Figure("gap_closed", "Share of the learnable gap closed", caption, [Panel("", "", "learnable gap closed (%)", marks)])
 
