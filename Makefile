@@ -42,7 +42,7 @@ policies: $(READY)
 		$(PYTHON) -m osel_sim.train --policy $$policy --data data/suite --out runs/train/$$policy --half --resume $(ARGS) && \
 		mkdir -p assets/policies/$$policy && cp runs/train/$$policy/*.json runs/train/$$policy/*.safetensors assets/policies/$$policy/ || exit 1; \
 	done
-	$(PYTHON) -m osel_sim.record --task all --level 0 2 --policies $(POLICIES) --instances $(INSTANCES) --repeats 3 --repeat-every 10 --action-noise 0.05 --out runs/suite $$([ ! -f runs/suite/run.json ] || echo --resume)
+	$(PYTHON) -m osel_sim.record --task all --level 0 2 --policies $(POLICIES) --instances $(INSTANCES) --repeats 3 --repeat-every 5 --action-noise 0.05 --out runs/suite $$([ ! -f runs/suite/run.json ] || echo --resume)
 
 wheel: $(READY)
 	$(PYTHON) -m build --no-isolation
