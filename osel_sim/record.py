@@ -28,6 +28,9 @@ Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.np
 files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies, more
 repeats and an encoder given with it are added to what is there, and the log is read with the encoder given last."""
 
+_FIXED = ("instances", "start_seed", "action_noise", "split")
+"""What a recording keeps from its beginning to its end, beside its tasks, levels and axes."""
+
 
 @cli.main
 def main(arguments: list[str] | None = None) -> int:
@@ -144,14 +147,17 @@ def _take_settings(options: argparse.Namespace, configuration: dict[str, Any]) -
     """Set the options to those that a recording began with; policies, repeats and encoder that were given come in addition."""
     try:
         options.task = configuration["tasks"]
-        options.level = configuration["levels"]
         options.axis = [part for axes in configuration["axes"] for part in axes.split(",")]
         options.policies = list(dict.fromkeys([*configuration["policies"], *(options.policies or [])]))
         options.encoder = options.encoder or configuration["encoder"].partition("@")[0]
         for name in ("repeats", "repeat_every"):
             setattr(options, name, getattr(options, name) or configuration[name])
-        for name in ("instances", "start_seed", "action_noise", "split"):
-            setattr(options, name, configuration[name])
+        for name, began in (("level", configuration["levels"]), *((name, configuration[name]) for name in _FIXED)):
+            given = getattr(options, name)
+            if given not in (began, parser().get_default(name)):
+                flag = f"--{name.replace('_', '-')} {' '.join(map(str, given)) if isinstance(given, list) else given}"
+                raise UsageError(f"{flag}: {options.out / 'run.json'} began with {began}; leave it out, or give another --out")
+            setattr(options, name, began)
     except KeyError as missing:
         raise DataError(
             f"{options.out / 'run.json'}: not of a recording by this version, it has no {missing}; give all flags it was made with"
@@ -171,9 +177,8 @@ def _as_it_began(configuration: dict[str, Any], before: dict[str, Any]) -> dict[
         digests = {key: value for key, value in configuration["content"].items() if key in content_then or key.partition(" ")[2] not in added}
         known |= {"policies": policies, "content": digests}
     repeats, every = before.get("repeats", 1), before.get("repeat_every", 1)
-    if configuration["repeats"] >= repeats and (
-        repeats == 1 or every % configuration["repeat_every"] == 0
-    ):  # every episode there was is still asked for
+    # More of them: every episode there was is still asked for.
+    if configuration["repeats"] >= repeats and (repeats == 1 or every % configuration["repeat_every"] == 0):
         known |= {"repeats": repeats, "repeat_every": every}
     return known
 

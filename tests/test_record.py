@@ -124,6 +124,9 @@ def test_repeats_added_to_a_log_give_the_bytes_of_all_at_once(world, reference):
     fewer = resume(world, folder, "--repeats", 1)
     assert fewer.returncode == 2 and f"repeats was {REPEATS} at the beginning, now it is 1" in fewer.stderr
     assert resume(world, folder, "--repeat-every", 2).returncode == 2
+    for flag, given in (("--instances", 7), ("--level", "0 2"), ("--action-noise", 0.5)):
+        other = resume(world, folder, flag, *str(given).split())
+        assert other.returncode == 2 and f"{flag} {given}: {folder / 'run.json'} began with" in other.stderr
     assert files(folder) == files(reference[0])
 
 

@@ -83,7 +83,7 @@ def oracle_table(result: Mapping[str, Any]) -> Table:
     learnable = ORACLES[result["learnable_oracle"]["name"]]
     caption = f"The learnable gap is that between the best single policy and the {learnable}."
     if repeated := result["learnable_oracle"].get("repeated"):
-        caption += f" Only {repeated} of {result['log']['instances']} instances have repeats, so that the expected oracle is an estimate."
+        caption += f" The expected one is an estimate, from the {repeated} of {result['log']['instances']} instances that have repeats."
     return Table("oracles", "What could have been", caption, columns, rows)
 
 
