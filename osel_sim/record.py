@@ -152,9 +152,10 @@ def _take_settings(options: argparse.Namespace, configuration: dict[str, Any]) -
         options.encoder = options.encoder or configuration["encoder"].partition("@")[0]
         for name in ("repeats", "repeat_every"):
             setattr(options, name, getattr(options, name) or configuration[name])
+        flags = parser()
         for name, began in (("level", configuration["levels"]), *((name, configuration[name]) for name in _FIXED)):
             given = getattr(options, name)
-            if given not in (began, parser().get_default(name)):
+            if given not in (began, flags.get_default(name)):
                 flag = f"--{name.replace('_', '-')} {' '.join(map(str, given)) if isinstance(given, list) else given}"
                 raise UsageError(f"{flag}: {options.out / 'run.json'} began with {began}; leave it out, or give another --out")
             setattr(options, name, began)

@@ -107,6 +107,9 @@ def test_repeats_missing_outcomes_and_the_half(tmp_path: Path, log):
     assert result["log"]["instances"] == 59 and result["log"]["left_out"]["by_policy"] == {"policy_0": 0, "policy_1": 1}
     assert "made_up/7" not in choices.instances and choices.repeats.max() == 3
     assert "expected" in result["oracles"] and result["learnable_oracle"]["name"] == "expected"
+    assert 0 < result["learnable_oracle"]["repeated"] <= result["log"]["instances"]
+    widths = {name: float(np.diff(entry["ci95"])[0]) for name, entry in result["oracles"].items()}
+    assert widths["expected"] > widths["predictable"] + 0.01, "the expected oracle alone is an estimate, and its interval says so"
     chance, best = result["selectors"]["random"], result["oracles"]["best_single"]["mean_reward"]
     gap = result["oracles"]["predictable"]["mean_reward"] - best
     assert chance["predictable_gap_closed"] == pytest.approx((chance["mean_reward"] - best) / gap) != chance["learnable_gap_closed"]
