@@ -27,9 +27,10 @@ RELEASE = 0.005
 """Height above what a thing is put on at which it is let go."""
 AWAY = 0.05
 """Height of the gripper above a thing it has left, metres."""
-FIT = {"peg": 0.005, "object": 0.012}
-"""How well a thing must be lined up with these kinds before it goes down on them, metres. No finer than it takes: where cameras cannot tell the last
-millimetres, what learns from this hovers for good."""
+FITTING = ("peg", "object")
+"""Kinds that a thing must be lined up with before it goes down on them."""
+FIT = 0.012
+"""How well it must be lined up, metres: no finer than it takes. Where cameras cannot tell the last millimetres, what learns from this hovers for good."""
 STEADY = 0.015
 """How far off the middle of another a thing still stands on it, metres."""
 ROOMY = 0.09
@@ -122,7 +123,7 @@ class Expert:
         if self._lost(thing):
             return self._again(thing)
         offset[2] = entity.floor + RELEASE - height
-        if sideways > FIT.get(entity.kind, np.inf):
+        if entity.kind in FITTING and sideways > FIT:
             offset[2] = max(world.highest_point(place) + 0.015 - world.lowest_point(thing), offset[2])
         return self._towards(world.grip_position + offset, 0.0, CLOSED), False
 
