@@ -30,7 +30,7 @@ AWAY = 0.05
 FITTING = ("peg", "object")
 """Kinds that a thing must be lined up with before it goes down on them."""
 FIT = 0.012
-"""How well it must be lined up, metres: no finer than it takes. Where cameras cannot tell the last millimetres, what learns from this hovers for good."""
+"""How well it must be lined up, metres, no finer than it takes: the last millimetres show in no camera, and what learns from this waits for them."""
 STEADY = 0.015
 """How far off the middle of another a thing still stands on it, metres."""
 ROOMY = 0.09
