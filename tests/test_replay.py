@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -219,7 +220,9 @@ def test_ctrl_c_leaves_nothing_behind(log, tmp_path):
     out = tmp_path / "out"
     # More seeds than any machine replays before the interruption, which comes once the workers are at it.
     command = [sys.executable, "-m", "osel_sim.replay", str(log), "--selectors", "ppo", "--seeds", "5000", "--out", str(out)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True) as process:
+    # Tests started in the background by a script ignore SIGINT, and what they start inherits that.
+    heeding = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, preexec_fn=heeding) as process:
         shown = b""
         while not re.search(rb"\| [1-9]", shown):  # the progress bar has moved on from 0
             shown += (got := process.stderr.read1())
