@@ -188,3 +188,19 @@ def test_at_every_level_it_is_the_same_task_in_view(env, level):
         assert np.isfinite(env.world.data.qpos).all()
         pixels = env.project(np.array([positions[name] for name in instance.roles.values() if name in positions]), "agentview", 96)
         assert ((pixels > 2) & (pixels < 94)).all(), (instance.key, pixels)
+
+
+def test_the_expert_does_not_wait_for_what_cameras_do_not_show():
+    env, random, directions = TaskEnv("stack"), np.random.default_rng(0), []
+    for seed in range(2000, 2008):
+        env.load(make_instance(env.task, seed))
+        expert, top, base = Expert(env.world), *(env.instance.roles[role] for role in ("top", "base"))
+        while not env.done:
+            action = expert.act()
+            aside = float(np.hypot(*(env.world.position(top) - env.world.position(base))[:2]))
+            above = env.world.lowest_point(top) - env.world.highest_point(base)
+            if 0.006 < aside < 0.011 and 0.012 < above < 0.03 and action[6] > 0:
+                directions.append(action[2])
+            env.advance(np.clip(action + np.append(0.3 * random.standard_normal(6), 0), -1, 1))
+    env.close()
+    assert len(directions) > 5 and max(directions) < 0, "some millimetres beside the middle of the cube below, it goes on down"
