@@ -13,6 +13,7 @@ from osel_sim.content import select_tasks
 from osel_sim.context.encoder import DEFAULT_ENCODER, WEIGHTS
 from osel_sim.errors import CheckpointError, UnknownNameError, UsageError
 from osel_sim.formats.levels import LEVELS
+from osel_sim.precision import computes_bfloat16
 
 STATE = "training_state.pt"
 REPORT = "training.json"
@@ -106,6 +107,7 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
     test = [cached_scenes(data, task, settings.test_scenes, "test", recipe.IMAGE_SIZE, settings.levels) for task in tasks]
     recipe.write_architecture(out)
     device = device or ("cuda" if torch.cuda.is_available() else "cpu")
+    bfloat16 = computes_bfloat16(device)
     torch.manual_seed(settings.seed)
     # channels_last makes bfloat16 convolutions on a CPU half again as fast
     model = open_clip.CLIP(**recipe.MODEL).to(device, memory_format=torch.channels_last)
@@ -129,7 +131,7 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
             # Each step has its own generator, so that a resumed training sees what an uninterrupted one would have seen.
             turn, chance = step % len(tasks), np.random.default_rng([settings.seed, step])
             batch = recipe.make_batch(scenes[turn], captions[turn], settings.views, settings.texts, chance, words)
-            with torch.autocast(device.partition(":")[0], torch.bfloat16):
+            with torch.autocast(device.partition(":")[0], torch.bfloat16, enabled=bfloat16):
                 loss = objective(batch, tokenizer(batch.texts))
             optimizer.zero_grad()
             loss.backward()

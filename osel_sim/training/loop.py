@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
+from osel_sim.precision import computes_bfloat16
 from osel_sim.training.recipe import Optimisation
 from osel_sim.training.state import load_state, save_state
 
@@ -42,6 +43,7 @@ class Trainer:
     ) -> None:
         self.policy, self._batch_of, self._settings = policy, batch_of, settings
         self._device, self._folder, self._fingerprint, self._seed = device, folder, fingerprint, seed
+        self._bfloat16 = computes_bfloat16(device)
         self.steps = settings.steps
         self.progress = Progress()
         decayed = [parameter for parameter in policy.parameters() if parameter.ndim > 1]
@@ -136,7 +138,7 @@ class Trainer:
 
     def _loss(self, batch: dict[str, Any]) -> tuple[Tensor, dict[str, float]]:
         moved = {name: value.to(self._device, non_blocking=True) if isinstance(value, Tensor) else value for name, value in batch.items()}
-        with torch.autocast(self._device, torch.bfloat16):
+        with torch.autocast(self._device, torch.bfloat16, enabled=self._bfloat16):
             loss, report = self.policy(moved)
         return loss, report
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from osel_sim import content
 from osel_sim.errors import DataError, UnknownNameError, UsageError
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.precision import computes_bfloat16
 from osel_sim.training.batches import Batches, frames_of, statistics_of
 from osel_sim.training.dataset import Demonstrations, dataset_folders, load_demonstrations, task_of
 from osel_sim.training.evaluation import validate
@@ -136,6 +137,7 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
             "wall_seconds": round(time.time() - began, 1),
             "threads": torch.get_num_threads(),
             "device": device,
+            "precision": "bfloat16" if computes_bfloat16(device) else "float32",
             "losses": trainer.progress.losses,
             "validation": validations,
         }

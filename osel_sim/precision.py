@@ -1,0 +1,17 @@
+"""In which precision torch trains."""
+
+
+def computes_bfloat16(device: str) -> bool:
+    """Whether a device multiplies in bfloat16 itself; models are trained in float32 where not.
+
+    On a processor that does not (AVX2 without AVX-512, say) oneDNN has no such convolution
+    (https://uxlfoundation.github.io/oneDNN/dev_guide_data_types.html), and PyTorch falls back on one that took ten times as long as in float32.
+
+    Args:
+        device: of torch, such as `cpu`, `cuda` or `cuda:1`.
+    """
+    import torch
+
+    if device.partition(":")[0] == "cuda":
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
