@@ -133,6 +133,7 @@ def test_what_the_shipped_policies_declare_is_found_in_unseen_words():
         "lift": "remote_base",
         "stack": "remote_base",
         "pick_place": "remote_base",
+        "nut_assembly": "remote_base",
         "push": "remote_specialist",
         "press_button": "remote_specialist",
     }
