@@ -83,7 +83,7 @@ def in_processes(options: argparse.Namespace) -> float:
     """Seconds that the replays of a log take."""
     from osel_sim.context.cache import ContextCache
     from osel_sim.formats.rollout_log import Row, write_rollouts
-    from osel_sim.offline.engine import replay
+    from osel_sim.offline.engine import Setup, replay
     from osel_sim.offline.log import read_log
     from osel_sim.selection.reward import RewardWeights
 
@@ -103,7 +103,7 @@ def in_processes(options: argparse.Namespace) -> float:
         write_rollouts(folder, rows, {"encoder": "made_up@1"})
         log = read_log(folder)
 
-    return timed(lambda: replay(log, RewardWeights(0.0, 0.0), ["ppo"], range(options.seeds), options.decisions, options.workers))
+    return timed(lambda: replay(log, [Setup(RewardWeights(0.0, 0.0))], ["ppo"], range(options.seeds), options.decisions, options.workers))
 
 
 def timed(function: Callable[[], object]) -> float:

@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,8 +10,7 @@ from osel_sim import cli
 from osel_sim.errors import UnknownNameError, UsageError
 
 if TYPE_CHECKING:
-    from osel_sim.formats.replay_result import Choices
-    from osel_sim.offline.beforehand import Beforehand
+    from osel_sim.offline.engine import Setup
     from osel_sim.offline.live import LiveLog
     from osel_sim.offline.log import LoggedOutcomes
     from osel_sim.selection.reward import RewardWeights
@@ -23,7 +22,7 @@ EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/pick_place                                   # every selector there is, 20 seeds
   python -m osel_sim.replay assets/logs/pick_place --selectors ppo ucb1 --preset waymo --out runs/ppo
   python -m osel_sim.replay assets/logs/suite --half score --selectors auto auto:warm   # without and with the outcomes of the other half beforehand
-  python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500
+  python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500 --no-frontier   # a quick look
   python -m osel_sim.replay runs/pick_place-ppo-s0                                   # a live run: off-policy estimates from its propensities
 
 Shows the log's instances in random orders without replacement to every selector, which sees only the outcome of its choice, and says how far each
@@ -31,8 +30,10 @@ stays from the oracles and whether routing is worth it. Fixed policies, the best
 Instances on which some policy has no valid outcome are left out and counted. The result does not depend on --workers.
 With --half a selector that learns off-policy can be shown all outcomes of the other half before its stream begins: auto:warm, linucb:warm ...
 
-Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv. Of a live run's folder it estimates what each
-fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes."""
+Once that is said and written, selectors are replayed at other weights of time and price too, for the frontier: about as long again.
+
+Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv, frontier.csv. Of a live run's folder it estimates
+what each fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes."""
 
 
 @cli.main
@@ -77,6 +78,7 @@ def parser() -> cli.Parser:
     add("--success", choices=("success", "subgoals", "score"), help="what counts as success in the reward (default: the preset's)")
     add("--unknown-costs", action="store_true", help="let all selectors learn what policies cost (default: auto is told, as it is declared)")
     add("--unknown-skills", action="store_true", help="do not tell auto what policies were made for (default: it is told what the log says of it)")
+    add("--no-frontier", action="store_true", help="do not replay selectors at other weights of time and price as well")
     add("--encoder", metavar="NAME", help="whose contexts, where the log has several (default: the one it was recorded with)")
     add("--workers", type=cli.positive_int, default=2, metavar="W", help="processes (default: %(default)s)")
     add("--out", type=Path, metavar="DIR", help="where to write (default: runs/replay-LOG)")
@@ -94,9 +96,12 @@ def _replay(
     off_policy: "dict[str, Any] | None" = None,
 ) -> None:
     """Replay, write and print."""
+    from tqdm import tqdm  # type: ignore[import-untyped]
+
     from osel_sim.formats.replay_result import write_replay
     from osel_sim.formats.rollout_log import DECLARED
-    from osel_sim.offline.beforehand import Beforehand
+    from osel_sim.offline.engine import replay
+    from osel_sim.offline.frontier import selector_frontiers
     from osel_sim.offline.oracles import oracles
     from osel_sim.offline.result import build, tables, with_fixed
     from osel_sim.offline.streams import complete_instances
@@ -108,7 +113,6 @@ def _replay(
     others = log
     if options.half:
         log, others = log.take(log.half(options.half)), log.take(~log.half(options.half))
-    costs = None if options.unknown_costs else others.expected_costs(weights)
     log, left_out = complete_instances(log, weights)
     if left_out.instances:
         print(f"warning: {left_out.instances} instances without an outcome of every policy are left out", file=sys.stderr)
@@ -118,16 +122,30 @@ def _replay(
             f"python -m osel_sim.record --resume --out {log.source} --encoder {log.encoder.partition('@')[0]} adds them",
             file=sys.stderr,
         )
+    setup = _setups(log, others, selectors, options)
     best = oracles(log, weights)
-    beforehand = Beforehand(others.contexts, others.rewards(weights)) if options.half else None
-    choices = with_fixed(_replay_all(log, weights, selectors, costs, options, beforehand), best)
+    decisions = len(log) if options.decisions is None else options.decisions
+    with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
+        (chosen,) = replay(log, [setup(weights)], selectors, range(options.seeds), options.decisions, options.workers, bar.update)
+    choices = with_fixed(chosen, best)
     result = build(log, weights, preset, choices, best, left_out, range(options.seeds))
     result["log"]["half"] = options.half
     result["off_policy"] = off_policy
-    result["expected_costs"] = costs
+    result["expected_costs"] = None if options.unknown_costs else others.expected_costs(weights)
     result["skills"] = None if log.skills is None or options.unknown_skills else {policy: list(names) for policy, names in log.skills.able.items()}
     write_replay(folder, result, choices, tables(result))
     print_replay(console(), result)
+    learners = [name for name in selectors if name != "random"]
+    if options.no_frontier or not learners:
+        return
+    with tqdm(desc="at other weights", unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
+
+        def show(made: int, total: int) -> None:
+            bar.total = total
+            bar.update(made - bar.n)
+
+        result["frontier"] = selector_frontiers(log, setup, weights, learners, options.seeds, options.decisions, options.workers, show)
+    write_replay(folder, result, choices, tables(result))
 
 
 def _off_policy(options: argparse.Namespace, live: "LiveLog", weights: "RewardWeights") -> dict[str, Any]:
@@ -150,32 +168,28 @@ def _write_off_policy(folder: Path, found: dict[str, Any]) -> None:
     print("The run has the outcomes of what was chosen only, so selectors cannot be replayed on it; run it with --counterfactual for that.")
 
 
-def _replay_all(
-    log: "LoggedOutcomes",
-    weights: "RewardWeights",
-    selectors: Sequence[str],
-    costs: "dict[str, float] | None",
-    options: argparse.Namespace,
-    beforehand: "Beforehand | None",
-) -> "Choices":
-    """Run the replays, with a progress bar.
+def _setups(
+    log: "LoggedOutcomes", others: "LoggedOutcomes", selectors: Sequence[str], options: argparse.Namespace
+) -> "Callable[[RewardWeights], Setup]":
+    """Under what to replay at any weights: what selectors are told, and shown beforehand.
 
     Args:
-        costs: of each policy, for those selectors that want to know them beforehand; None: for none.
-        beforehand: shown to selectors named `NAME:warm`; None where there is no other half.
+        log: what is replayed.
+        others: what costs are known from, and what selectors named `NAME:warm` are shown: the other half, where it is a half that is replayed.
     """
-    from tqdm import tqdm  # type: ignore[import-untyped]
-
-    from osel_sim.offline.engine import replay
+    from osel_sim.offline.beforehand import Beforehand
+    from osel_sim.offline.engine import Setup
     from osel_sim.selection.registry import wanted_of
 
-    known: dict[str, Any] = {COSTS: costs} if costs is not None and set(costs) == set(log.policies) else {}
-    if log.skills is not None and not options.unknown_skills:
-        known[SKILLS] = log.skills
-    told = {name: wanted_of(name, known) for name in selectors}
-    decisions = len(log) if options.decisions is None else options.decisions
-    with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
-        return replay(log, weights, selectors, range(options.seeds), options.decisions, options.workers, told, bar.update, beforehand)
+    def setup(weights: "RewardWeights") -> Setup:
+        costs = None if options.unknown_costs else others.expected_costs(weights)
+        known: dict[str, Any] = {COSTS: costs} if costs is not None and set(costs) == set(log.policies) else {}
+        if log.skills is not None and not options.unknown_skills:
+            known[SKILLS] = log.skills
+        beforehand = Beforehand(others.contexts, others.rewards(weights)) if options.half else None
+        return Setup(weights, {name: wanted_of(name, known) for name in selectors}, beforehand)
+
+    return setup
 
 
 def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[str]:

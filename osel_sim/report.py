@@ -45,7 +45,6 @@ def parser() -> cli.Parser:
     add("--out", type=Path, metavar="DIR", help="where to write (default: into the folder itself)")
     add("--open", action="store_true", help="show it in the browser")
     add("--log", type=cli.folder, metavar="DIR", help="of a replay: its rollout log, where that is no longer where it was")
-    add("--frontier", nargs="+", default=[], metavar="NAME", help="of a replay: selectors to replay at other weights too (a minute each)")
     add("--scenes", type=cli.non_negative_int, default=0, metavar="N", help="render how N instances begin, again from their seeds (default: none)")
     add("--tasks", type=cli.folder, metavar="DIR", help="with --scenes: folder with task files of your own")
     add("--preset", metavar="NAME", help=f"of a rollout log: reward weights of the paper: mmlu, waymo, alfred, oxe (default: {DEFAULT_PRESET})")
@@ -82,7 +81,7 @@ def _page(options: argparse.Namespace) -> "Page":
     if (folder / REPLAY).is_file():
         from osel_sim.reporting.replay_page import ReplayOptions, replay_page
 
-        return replay_page(folder, ReplayOptions(options.log, draw, options.frontier))
+        return replay_page(folder, ReplayOptions(options.log, draw))
     if (folder / JOURNAL).is_file():
         from osel_sim.reporting.run_page import run_page
 

@@ -18,11 +18,12 @@ from osel_sim import replay
 from osel_sim.errors import DataError
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.formats.rollout_log import write_rollouts
+from osel_sim.offline.engine import Setup
 from osel_sim.offline.engine import replay as replay_all
 from osel_sim.offline.log import read_log
 from osel_sim.selection.reward import RewardWeights
 
-FREE = ["--alpha-time", "0", "--alpha-price", "0", "--workers", "1"]
+FREE = ["--alpha-time", "0", "--alpha-price", "0", "--workers", "1", "--no-frontier"]
 
 
 @pytest.fixture(scope="module")
@@ -119,6 +120,33 @@ def test_repeats_missing_outcomes_and_the_half(tmp_path: Path, log):
     assert 250 < result["log"]["instances"] < 350 and choices.order.shape == (2, 50)
 
 
+def test_the_frontier_follows_the_price(tmp_path: Path, capsys):
+    """One policy solves everything for ten cents, the other half of it, which the context tells, for nothing."""
+    rows = []
+    for number in range(80):
+        rows.append(make_row(f"i{number}", "free", success=number % 2 == 0, motion=2.0))
+        rows.append(make_row(f"i{number}", "paid", success=True, motion=4.0, price=10.0))
+    folder = write_log(tmp_path / "log", rows, {f"i{row}": 3.0 * np.eye(8)[row % 2] + 0.1 * np.eye(8)[2 + row % 6] for row in range(80)})
+    flags = ["--selectors", "linucb", "random", "--seeds", 2, "--alpha-time", 0, "--alpha-price", 0.01, "--workers", 1]
+    assert run(folder, "--out", tmp_path / "out", *flags) == 0
+    result, _ = read_replay(tmp_path / "out")
+    found = result["frontier"]
+    assert (found["seeds"], found["decisions"]) == (1, 80)
+    for axis in ("alpha_time", "alpha_price"):
+        assert found[axis]["weights"][0] == 0 and np.all(np.diff(found[axis]["weights"]) > 0)
+        assert set(found[axis]["selectors"]) == {"linucb"}
+    own = found["alpha_price"]["selectors"]["linucb"]
+    assert own["price"][0] > 4 > own["price"][-1] == 0 and own["success"][0] > 0.9 > own["success"][-1] == pytest.approx(0.5, abs=0.15)
+    assert min(own["price"]) < 6 and own["seconds"][0] > own["seconds"][-1]
+    with (tmp_path / "out" / "frontier.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 12 and [float(row["price"]) for row in rows if row["weight"] == "alpha_price"] == own["price"]
+    without = result | {"frontier": None}
+    assert run(folder, "--out", tmp_path / "without", *flags, "--no-frontier") == 0
+    again, _ = read_replay(tmp_path / "without")
+    assert again == without, "what is measured at the weights given does not depend on it"
+
+
 def test_a_warm_start_spares_the_beginning(tmp_path: Path, log):
     assert run(log, "--half", "score", "--selectors", "linucb", "linucb:warm", "--seeds", 3, "--out", tmp_path / "out", *FREE) == 0
     result, choices = read_replay(tmp_path / "out")
@@ -158,19 +186,23 @@ def test_auto_is_told_what_the_log_says_of_its_policies(tmp_path: Path, capsys):
 def test_workers_do_not_matter(log):
     names = ["ppo_tuned", "linucb", "epsilon_greedy"]
     outcomes = read_log(log)
-    one, two = (replay_all(outcomes, RewardWeights(0.0, 0.0), names, range(2), 90, workers) for workers in (1, 2))
-    assert (one.order == two.order).all() and all((one.chosen[name] == two.chosen[name]).all() for name in names)
+    setups = [Setup(RewardWeights(0.0, 0.0)), Setup(RewardWeights(0.1, 0.0), {"linucb": {"optimism": 5.0}})]
+    one, two = (replay_all(outcomes, setups, names, range(2), 90, workers) for workers in (1, 2))
+    for number in range(2):
+        assert (one[number].order == two[number].order).all()
+        assert all((one[number].chosen[name] == two[number].chosen[name]).all() for name in names)
+    assert (one[0].chosen["linucb"] != one[1].chosen["linucb"]).any(), "each setup has its own settings"
 
 
 def test_a_selector_sees_the_outcomes_of_its_choices_only(log, monkeypatch):
     outcomes = read_log(log)
-    first = replay_all(outcomes, RewardWeights(0.0, 0.0), ["linucb"], range(1), 100)
+    (first,) = replay_all(outcomes, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)
     chosen = np.zeros_like(outcomes.success, bool)
     rows = first.order[0]
     chosen[rows, first.chosen["linucb"][0], 0] = True
     other = read_log(log)
     other.success[~chosen] = 1.0 - other.success[~chosen]
-    again = replay_all(other, RewardWeights(0.0, 0.0), ["linucb"], range(1), 100)
+    (again,) = replay_all(other, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)
     assert (again.chosen["linucb"] == first.chosen["linucb"]).all()
 
 

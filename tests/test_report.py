@@ -85,19 +85,12 @@ def test_page_of_a_replay(log, tmp_path):
     assert set(rows) == {"ppo", "random", f"always {NEAR} (worst single)", f"always {FAR} (best single)"}
     curve = next(trace for trace in data["figures"]["curves"]["panels"][0]["data"] if trace["name"] == "ppo" and trace.get("showlegend", True))
     assert curve["y"][-1] == pytest.approx(result["selectors"]["ppo"]["mean_reward"], abs=1e-4)
+    panels = data["figures"]["frontier"]["panels"]
+    lines = [next(trace for trace in panel["data"] if trace["name"] == "ppo" and trace["mode"] == "lines+markers") for panel in panels]
+    assert [line["y"] for line in lines] == [[90.0, 80.0, None], [70.0, 60.0, 50.0]] and lines[0]["x"] == [5.0, 4.0, None]
     assert set(data["episodes"]["picks"]) == {"ppo"}
     headline = "Route with ppo" if result["verdict"]["decision"] == "route" else "Do not route: always use far&lt;i&gt;"
     assert headline in page
-
-
-def test_the_frontier_of_a_selector(log, tmp_path, capsys):
-    folder = made_replay(tmp_path, log)
-    assert report.main([str(folder), "--frontier", "rando"]) == 2
-    assert "did you mean 'random'?" in capsys.readouterr().err
-    assert report.main([str(folder), "--frontier", "random"]) == 0
-    panels = embedded((folder / "report.html").read_text())["figures"]["frontier"]["panels"]
-    lines = [next(trace for trace in panel["data"] if trace["name"] == "random" and trace["mode"] == "lines+markers") for panel in panels]
-    assert [len(line["x"]) for line in lines] == [9, 9]
 
 
 def test_a_replay_whose_log_has_moved(log, tmp_path, capsys):

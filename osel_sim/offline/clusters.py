@@ -161,7 +161,7 @@ def inequality(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWe
     return Inequality(
         float(sum(share * value for share, value in by_cluster)),
         float(rewards.mean(axis=0).max()),
-        _held_out(rewards, own, part.half("choose")),
+        _held_out(rewards, own, part.first_half()),
         float(sum(share * value for share, value in paper)),
         float(max(paper_sides(part, weights, remote))),
     )

@@ -2,11 +2,11 @@
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,30 +28,46 @@ SLOW_FIRST = ("ppo", "auto:warm", "auto", "neural_linear", "ppo_tuned", "vw_regc
 
 
 @dataclass(frozen=True)
+class Setup:
+    """Under what a log is replayed.
+
+    Attributes:
+        weights: of the reward.
+        settings: selector -> keyword arguments, where they are not to be the defaults.
+        beforehand: of other instances than the log's; needed for selectors named `NAME:warm`.
+    """
+
+    weights: RewardWeights
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    beforehand: Beforehand | None = None
+
+
+@dataclass(frozen=True)
 class _Material:
-    """What a worker needs: contexts float32 (N, D), rewards (N, P, R), the streams, the seeds, policies, and each selector's settings."""
+    """What a worker needs: contexts float32 (N, D), seeds, policies, and of each setup its rewards (N, P, R) and its streams."""
 
     contexts: NDArray[np.float32]
-    rewards: NDArray[np.float64]
-    streams: Streams
     seeds: tuple[int, ...]
     policies: tuple[str, ...]
-    settings: dict[str, dict[str, Any]]
-    beforehand: Beforehand | None
+    setups: tuple[Setup, ...]
+    rewards: tuple[NDArray[np.float64], ...]
+    streams: tuple[Streams, ...]
+
+
+_Job = tuple[int, str, int]
+"""Which setup, which selector, which seed (its position)."""
 
 
 def replay(
     log: LoggedOutcomes,
-    weights: RewardWeights,
+    setups: Sequence[Setup],
     selectors: Sequence[str],
     seeds: Sequence[int],
     decisions: int | None = None,
     workers: int = 1,
-    settings: dict[str, dict[str, Any]] | None = None,
     progress: Callable[[int], Any] | None = None,
-    beforehand: Beforehand | None = None,
-) -> Choices:
-    """Show the streams of all seeds to every selector.
+) -> list[Choices]:
+    """Show the streams of all seeds to every selector, under each setup.
 
     Args:
         log: complete instances only (`osel_sim.offline.streams.complete_instances`).
@@ -59,27 +75,24 @@ def replay(
         seeds: of the streams, and of the selectors.
         decisions: length of a stream; None: all instances.
         workers: processes; with 1 it happens in this one.
-        settings: selector -> keyword arguments, where they are not to be the defaults.
         progress: called with a number of decisions made.
-        beforehand: of other instances than the log's; needed for selectors named `NAME:warm`.
 
     Raises:
         UsageError: a selector is to start warm and there is nothing to show it.
     """
-    if beforehand is None and any(name.endswith(WARM) for name in selectors):
-        raise UsageError(
-            f"{', '.join(name for name in selectors if name.endswith(WARM))}: there are no outcomes of other instances to show beforehand"
-        )
-    table = log.rewards(weights)
-    streams = draw_streams(table, seeds, decisions)
-    material = _Material(log.contexts, table, streams, tuple(seeds), log.policies, settings or {}, beforehand)
-    jobs = [(name, number) for name in sorted(selectors, key=_slowness) for number in range(len(seeds))]
-    chosen = {name: np.zeros(streams.order.shape, np.int8) for name in selectors}
-    for name, number, columns in _run(material, jobs, workers):
-        chosen[name][number] = columns
+    warm = [name for name in selectors if name.endswith(WARM)]
+    if warm and any(setup.beforehand is None for setup in setups):
+        raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to show beforehand")
+    tables = tuple(log.rewards(setup.weights) for setup in setups)
+    streams = tuple(draw_streams(table, seeds, decisions) for table in tables)
+    material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams)
+    jobs = [(at, name, number) for name in sorted(selectors, key=_slowness) for at in range(len(setups)) for number in range(len(seeds))]
+    chosen = [{name: np.zeros(own.order.shape, np.int8) for name in selectors} for own in streams]
+    for (at, name, number), columns in _run(material, jobs, workers):
+        chosen[at][name][number] = columns
         if progress is not None:
             progress(len(columns))
-    return Choices(log.keys, log.policies, streams.order, streams.repeats, chosen)
+    return [Choices(log.keys, log.policies, own.order, own.repeats, names) for own, names in zip(streams, chosen, strict=True)]
 
 
 def replay_one(
@@ -123,16 +136,16 @@ def _slowness(name: str) -> int:
     return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
 
 
-def _run(material: _Material, jobs: Sequence[tuple[str, int]], workers: int) -> Iterator[tuple[str, int, NDArray[np.int8]]]:
+def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
     if workers == 1:
         with _one_thread():
             for job in jobs:
-                yield _job(material, *job)
+                yield _replay_job(material, job)
         return
     context = multiprocessing.get_context("spawn")  # a forked torch or numba is a hang waiting to happen
     with ProcessPoolExecutor(workers, context, _prepare, (material,)) as pool:
         try:
-            for future in as_completed([pool.submit(_in_worker, *job) for job in jobs]):
+            for future in as_completed([pool.submit(_in_worker, job) for job in jobs]):
                 yield future.result()
         except BrokenProcessPool:
             raise OselError("a worker process of the replay died (out of memory?); try --workers 1") from None
@@ -156,19 +169,20 @@ def _prepare(material: _Material) -> None:
     _material = material
 
 
-def _in_worker(name: str, number: int) -> tuple[str, int, NDArray[np.int8]]:
+def _in_worker(job: _Job) -> tuple[_Job, NDArray[np.int8]]:
     if _material is None:
         raise OselError("a worker process of the replay was not prepared")
-    return _job(_material, name, number)
+    return _replay_job(_material, job)
 
 
-def _job(material: _Material, name: str, number: int) -> tuple[str, int, NDArray[np.int8]]:
-    streams = material.streams
-    rewards = streams.rewards(material.rewards, number)
+def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int8]]:
+    at, name, number = job
+    setup, streams = material.setups[at], material.streams[at]
+    rewards = streams.rewards(material.rewards[at], number)
     contexts = material.contexts[streams.order[number]]
     contexts.flags.writeable = False
-    kind, shown = name.removesuffix(WARM), material.beforehand if name.endswith(WARM) else None
-    return name, number, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, **material.settings.get(name, {}))
+    kind, shown = name.removesuffix(WARM), setup.beforehand if name.endswith(WARM) else None
+    return job, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, **setup.settings.get(name, {}))
 
 
 def _limit_threads() -> Any:

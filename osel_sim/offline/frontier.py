@@ -1,20 +1,26 @@
 """Success against seconds and against price as one weight sweeps from nothing to where it settles everything."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.offline.clusters import complete_instances
+from osel_sim.errors import DataError
+from osel_sim.offline.clusters import complete_instances, find_clusters
+from osel_sim.offline.engine import Setup, replay
 from osel_sim.offline.log import Array, LoggedOutcomes, mean_over_repeats
-from osel_sim.offline.weights_map import Axis, moved
+from osel_sim.offline.weights_map import AXES, Axis, limits, moved
 from osel_sim.selection.reward import RewardWeights
 
 _POINTS = 49
-_REPLAYED = 9
-"""Weights at which a selector is replayed: a replay takes seconds where an oracle takes none."""
+_REPLAYED = 6
+"""Weights at which selectors are replayed: a replay takes seconds where an oracle takes none."""
+_DECISIONS = 1_000
+_SEEDS_FOR_EACH = 10
+
+MEASURED = ("success", "seconds", "price")
 
 Chooser = Callable[[Array], NDArray[np.int64]]
 """Of rewards (N, P): the column chosen for each instance, (N,)."""
@@ -41,17 +47,18 @@ def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWei
     """Frontiers of the hindsight oracle and of the best policy of each cluster.
 
     The cluster's policy is chosen on the half of the instances that the one at hand is not in; what it comes to is then what one could have had. It
-    stands for a selector that has learnt all that the clusters tell. Selectors that learn are replayed at each weight (`selector_frontier`).
+    stands for a selector that has learnt all that the clusters tell. Selectors that learn are replayed at each weight (`selector_frontiers`).
 
     Args:
         labels: (N,) cluster of each instance.
         sweep: which weight.
         high: up to where, from a ten-thousandth of it, and 0.
     """
-    part = log.take(complete_instances(log, weights))
-    own, first = labels[complete_instances(log, weights)], part.half("choose")
+    complete = complete_instances(log, weights)
+    part = log.take(complete)
+    own, first = labels[complete], part.first_half()
     swept = np.concatenate([[0.0], np.geomspace(high / 10_000, high, _POINTS - 1)])
-    tables = [mean_over_repeats(values) for values in (part.success, part.seconds, part.price)]
+    tables = [mean_over_repeats(getattr(part, name)) for name in MEASURED]
     choosers: dict[str, Chooser] = {"hindsight oracle": lambda rewards: rewards.argmax(axis=1)}
     if first.any() and not first.all():
         choosers["best policy of each cluster"] = lambda rewards: _by_cluster(rewards, own, first)
@@ -63,28 +70,60 @@ def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWei
     return found
 
 
-def selector_frontier(log: LoggedOutcomes, weights: RewardWeights, selector: str, sweep: Axis, high: float, told: bool, seeds: int = 2) -> Frontier:
-    """Frontier of a selector that learns, replayed anew at each of a few weights: means over the last quarter of its streams.
+def selector_frontiers(
+    log: LoggedOutcomes,
+    setup: Callable[[RewardWeights], Setup],
+    weights: RewardWeights,
+    selectors: Sequence[str],
+    seeds: int,
+    decisions: int | None,
+    workers: int,
+    progress: Callable[[int, int], Any],
+) -> dict[str, Any] | None:
+    """Frontiers of selectors that learn, replayed anew at each of a few weights: means over the last quarter of their streams.
 
     Args:
-        log: complete instances only. Its skills, if it has any, are told.
-        told: whether a selector that takes expected costs is told those of the log.
-        seeds: streams at each weight; of 1,000 decisions at most.
-    """
-    from osel_sim.offline.engine import replay
-    from osel_sim.selection.registry import wanted_of
+        log: complete instances only.
+        setup: under what to replay at other weights.
+        weights: in the middle.
+        seeds, decisions: of the replay that this goes with; a tenth of the seeds and 1,000 decisions at most are replayed at each weight.
+        progress: called with a number of decisions made, and that of all there will be.
 
-    swept = np.concatenate([[0.0], np.geomspace(high / 300, high, _REPLAYED - 1)])
-    decisions = min(len(log), 1_000)
-    late = slice(decisions * 3 // 4, None)
-    found = []
-    for value in swept:
-        here = moved(weights, sweep, float(value))
-        known: dict[str, Any] = {"skills": log.skills} | ({"expected_costs": log.expected_costs(here)} if told else {})
-        choices = replay(log, here, [selector], range(seeds), decisions, settings={selector: wanted_of(selector, known)})
-        found.append([_mean(choices.received(selector, table)[:, late]) for table in (log.success, log.seconds, log.price)])
-    success, seconds, price = np.array(found).T
-    return Frontier(selector, swept, success, seconds, price)
+    Returns:
+        seeds, decisions, and of each weight that something in the log hangs on: weights [K] from 0, selectors {name: {success, seconds, price: [K],
+        None where unknown}}. None where there are too few instances to say up to where to look.
+    """
+    try:
+        ends = limits(log, find_clusters(log.contexts).labels, weights)
+    except DataError:
+        return None
+    streams = range(max(1, seeds // _SEEDS_FOR_EACH))
+    length = min(len(log) if decisions is None else decisions, _DECISIONS)
+    axes = [axis for axis, values in zip(AXES, (log.seconds, log.price), strict=True) if np.isfinite(values).any()]
+    found: dict[str, Any] = {"seeds": len(streams), "decisions": length}
+    made = 0
+
+    def count(number: int) -> None:
+        nonlocal made
+        made += number
+        progress(made, total)
+
+    total = len(axes) * _REPLAYED * len(selectors) * len(streams) * length
+    for axis in axes:
+        swept = np.concatenate([[0.0], np.geomspace(ends[axis] / 300, ends[axis], _REPLAYED - 1)])
+        part = log.take(complete_instances(log, moved(weights, axis, ends[axis])))
+        late = slice(min(length, len(part)) * 3 // 4, None)
+        setups = [setup(moved(weights, axis, float(value))) for value in swept]
+        choices = replay(part, setups, selectors, streams, min(length, len(part)), workers, count)
+        tables = {name: getattr(part, name) for name in MEASURED}
+        found[axis] = {
+            "weights": swept.tolist(),
+            "selectors": {
+                selector: {name: [_known(_mean(own.received(selector, table)[:, late])) for own in choices] for name, table in tables.items()}
+                for selector in selectors
+            },
+        }
+    return found
 
 
 def _by_cluster(rewards: Array, labels: NDArray[np.int64], first: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -100,3 +139,7 @@ def _by_cluster(rewards: Array, labels: NDArray[np.int64], first: NDArray[np.boo
 def _mean(values: Array) -> float:
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else float("nan")
+
+
+def _known(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -142,6 +142,13 @@ class LoggedOutcomes:
         """Which instances, (N,), belong to a half: one to choose settings or policies by, the other to score them on."""
         return np.array([instance.half == which for instance in self.instances], bool)
 
+    def first_half(self) -> NDArray[np.bool_]:
+        """Which instances, (N,), are on one side of a cross-fit: those of the half `choose`; where all are of one half, a random half of them."""
+        first = self.half("choose")
+        if first.any() and not first.all():
+            return first
+        return np.random.default_rng(0).permutation(len(self)) % 2 == 0
+
     def labels(self, attribute: str) -> tuple[str, ...]:
         """An attribute of every instance (`task`, `target`, `phrasing` ...) as text, (N,); empty where the log does not have it."""
         values = (getattr(instance, attribute) for instance in self.instances)

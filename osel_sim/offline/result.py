@@ -12,6 +12,7 @@ from osel_sim.offline.measures import curves, measure, paired
 from osel_sim.offline.oracles import Oracles
 from osel_sim.offline.streams import LeftOut
 from osel_sim.offline.verdict import reward_span, verdict
+from osel_sim.offline.weights_map import AXES
 from osel_sim.selection.reward import RewardWeights
 
 BEST, WORST = "best_single", "worst_single"
@@ -39,7 +40,8 @@ def build(
 
     Returns:
         log (folder, instances, left_out, policies, repeats, encoder, tasks), reward, seeds, decisions, selectors, oracles, learnable_oracle, paired,
-        verdict. Each selector has a `kind`: `learner`, `random` or `fixed` (with its `policy`).
+        verdict, and frontier, which is None until it is replayed (`osel_sim.offline.frontier`). Each selector has a `kind`: `learner`, `random` or
+        `fixed` (with its `policy`).
     """
     rewards = curves(log, weights, choices, best)
     policies = choices.policies
@@ -76,6 +78,7 @@ def build(
         },
         "paired": paired(rewards, [*learners, *(name for name, entry in selectors.items() if entry["kind"] == "random"), BEST]),
         "verdict": verdict(rewards, learners, selectors, policies[best.best_single], reward_span(log.rewards(weights))),
+        "frontier": None,
     }
 
 
@@ -93,13 +96,21 @@ def kind(name: str, singles: Mapping[str, str]) -> dict[str, Any]:
 
 
 def tables(result: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Tables for CSV files: `selectors`, `oracles`, `paired`; an interval becomes two columns."""
+    """Tables for CSV files: `selectors`, `oracles`, `paired`, `frontier`; an interval becomes two columns."""
     selectors = [{"selector": name, **_flat(entry)} for name, entry in result["selectors"].items()]
     columns = list(dict.fromkeys(key for row in selectors for key in row))
+    frontier = result["frontier"] or {}
     return {
         "selectors": [{key: row.get(key) for key in columns} for row in selectors],
         "oracles": [{"oracle": name, **_flat(entry)} for name, entry in result["oracles"].items()],
         "paired": [_flat(entry) for entry in result["paired"]],
+        "frontier": [
+            {"weight": axis, "value": value, "selector": name, **{measured: values[at] for measured, values in entry.items()}}
+            for axis in AXES
+            if axis in frontier
+            for name, entry in frontier[axis]["selectors"].items()
+            for at, value in enumerate(frontier[axis]["weights"])
+        ],
     }
 
 

@@ -106,6 +106,15 @@ def trivial_ranges(log: LoggedOutcomes, labels: NDArray[np.int64], weights: Rewa
     return ranges
 
 
+def limits(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWeights) -> dict[Axis, float]:
+    """Up to where the map, the ranges and the frontier look along each weight.
+
+    Args:
+        labels: (N,) cluster of each instance.
+    """
+    return dict(zip(AXES, _ends(_means(log, labels, weights), weights), strict=True))
+
+
 def moved(weights: RewardWeights, axis: Axis, value: float) -> RewardWeights:
     """The weights with another value of one of them."""
     return replace(weights, alpha_time=value) if axis == "alpha_time" else replace(weights, alpha_price=value)

@@ -1,17 +1,17 @@
 """Section IV of the paper on a log, as figures and tables: clusters, what context is worth, trivial weights, frontiers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.offline.clusters import Cluster, Clustering, Inequality, describe, find_clusters, inequality
 from osel_sim.offline.estimate import mean_of
-from osel_sim.offline.frontier import frontiers, selector_frontier
+from osel_sim.offline.frontier import frontiers
 from osel_sim.offline.log import Array, LoggedOutcomes, mean_over_repeats
-from osel_sim.offline.weights_map import TrivialRange, trivial_ranges, weights_map
+from osel_sim.offline.weights_map import Axis, TrivialRange, trivial_ranges, weights_map
 from osel_sim.reporting.description import Bars, Cell, Column, Figure, Heat, Line, Mark, Panel, Points, Table, colours
 from osel_sim.reporting.tables import to_text
 from osel_sim.selection.reward import PRESETS, RewardWeights
@@ -28,15 +28,15 @@ class Replayed:
 
     Attributes:
         points: success, seconds and price of each at the weights given.
+        swept: what they came to at others, as `osel_sim.offline.frontier.selector_frontiers` gives it; None where that was not replayed.
         colour: of each.
-        sweep: those to replay at other weights too.
-        told: whether those that take expected costs are told them.
+        shown: those drawn without being asked for.
     """
 
     points: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    swept: Mapping[str, Any] | None = None
     colour: Mapping[str, str] = field(default_factory=dict)
-    sweep: Sequence[str] = ()
-    told: bool = False
+    shown: Collection[str] = ()
 
 
 class Routing(NamedTuple):
@@ -72,17 +72,18 @@ def weights_blocks(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[
     """Where routing is trivial, as a map over both weights and as ranges of each."""
     found = weights_map(log, routing.clustering.labels, weights, remote)
     x, y, xs, ys = "alpha_time", "alpha_price (per cent)", found.alpha_time, found.alpha_price
-    here = Points("these weights", [weights.alpha_time], [weights.alpha_price], "ink", ["these weights"], size=13, symbol="star")
-    others = [
-        (name, other)
-        for name, other in PRESETS.items()
+    inside = {
+        name: other
+        for name, other in {**PRESETS, "these weights": weights}.items()
         if other.time_unit == weights.time_unit and xs[0] <= other.alpha_time <= xs[-1] and ys[0] <= other.alpha_price <= ys[-1]
+    }
+    points: list[Mark] = [
+        Points(name, [other.alpha_time], [other.alpha_price], "ink", size=13, symbol="star", labelled=True)
+        if name == "these weights"
+        else Points(f"preset {name}", [other.alpha_time], [other.alpha_price], "muted", symbol="diamond", labelled=True)
+        for name, other in inside.items()
+        if name == "these weights" or (other.alpha_time, other.alpha_price) != (weights.alpha_time, weights.alpha_price)
     ]
-    marks: list[Mark] = [
-        Points(f"preset {name}", [other.alpha_time], [other.alpha_price], "muted", [f"preset {name}"], symbol="diamond") for name, other in others
-    ]
-    inside = xs[0] <= weights.alpha_time <= xs[-1] and ys[0] <= weights.alpha_price <= ys[-1]
-    points = [*marks, here] if inside else marks
     near = np.outer(_within_a_decade(ys, weights.alpha_price), _within_a_decade(xs, weights.alpha_time))
     most = max(float(found.gain[near].max() if near.any() else found.gain.max()), 1e-3)
     who = Heat("instances to a remote policy (%)", xs, ys, 100 * found.remote_share, "diverging", 0, 100)
@@ -116,21 +117,35 @@ def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routin
                 marks.append(
                     Points(f"always {policy}", [tables[against][column]], [100 * tables["success"][column]], own[policy], size=11, symbol="diamond")
                 )
-        for name in replayed.sweep:
-            line = selector_frontier(log, weights, name, found.axis, found.limit, replayed.told)
-            texts = [f"{name}, {found.axis} {value:.3g}" for value in line.weights]
-            marks.append(Line(name, getattr(line, against), 100 * line.success, replayed.colour.get(name, "muted"), dots=True, texts=texts))
-        for name, values in replayed.points.items():
-            if against in values and "success" in values:
-                marks.append(Points(name, [values[against]], [100 * values["success"]], replayed.colour.get(name, "muted"), size=9))
+        for name in replayed.points:
+            marks += _selector_marks(name, found.axis, against, replayed)
         title = f"{found.axis} from 0 to {found.limit:.2g}, {other} = {getattr(weights, other):g}"
         panels.append(Panel(title, label, "success (%)", marks))
     caption = (
-        "Lines: what the hindsight oracle, and the best policy of each cluster (chosen on one half of the instances, scored on the other), come to "
-        "as one weight sweeps. Up and to the left is better. Selectors: the last quarter of their streams, a dot at these weights, and a line "
-        "where they were replayed at other weights as well (--frontier)."
+        "Black: what the hindsight oracle (dashed), and the best policy of each cluster (chosen on one half of the instances, scored on the other), "
+        "come to as one weight sweeps. Up and to the left is better."
     )
+    if replayed.points:
+        caption += " Selectors: the last quarter of their streams, a large dot at these weights."
+    if replayed.swept:
+        caption += (
+            f" Their lines: replayed at other weights, in {replayed.swept['seeds']} streams of {replayed.swept['decisions']:,} decisions at each."
+        )
     return Figure("frontier", "Frontier: success against time and price", caption, panels)
+
+
+def _selector_marks(name: str, axis: Axis, against: str, replayed: Replayed) -> list[Mark]:
+    """A selector on the frontier: a line where it was replayed at other weights, and a dot at these."""
+    colour, shown, values = replayed.colour.get(name, "muted"), name in replayed.shown, replayed.points[name]
+    marks: list[Mark] = []
+    swept = (replayed.swept or {}).get(axis)
+    if swept and name in swept["selectors"]:
+        line = {key: np.array(swept["selectors"][name][key], np.float64) for key in ("success", against)}  # None becomes NaN
+        texts = [f"{name}, {axis} {value:.3g}" for value in swept["weights"]]
+        marks.append(Line(name, line[against], 100 * line["success"], colour, dots=True, texts=texts, shown=shown))
+    if against in values and "success" in values:
+        marks.append(Points(name, [values[against]], [100 * values["success"]], colour, size=9, shown=shown))
+    return marks
 
 
 def _cluster_figure(log: LoggedOutcomes, routing: Routing) -> Figure:

@@ -1,13 +1,13 @@
 """The page of a replay."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.errors import DataError, UsageError
 from osel_sim.formats.replay_result import REPLAY, Choices, read_replay
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.offline.clusters import score_of
@@ -45,12 +45,10 @@ class ReplayOptions:
     Attributes:
         log: where the rollout log now lies; None: where it was when it was replayed.
         scenes: draws how some of its instances begin.
-        frontier: selectors to replay at other weights.
     """
 
     log: Path | None = None
     scenes: Scenes = no_scenes
-    frontier: Sequence[str] = ()
 
 
 def replay_page(folder: Path, options: ReplayOptions) -> Page:
@@ -84,10 +82,7 @@ def _page(folder: Path, result: Mapping[str, Any], choices: Choices, options: Re
     selectors += [oracle_table(result), *paired_tables(result, names)]
     selectors += [off_policy_table(result["off_policy"])] if result.get("off_policy") else []
     points = {shown: _point(streams[shown]) for name, shown in names.items() if not name.startswith("fixed:")}
-    for name in options.frontier:
-        if name not in result["selectors"] or result["selectors"][name]["kind"] == "fixed":
-            raise UnknownNameError("selector", name, [known for known, entry in result["selectors"].items() if entry["kind"] != "fixed"], str(folder))
-    replayed = Replayed(points, style.colour, options.frontier, told=result.get("expected_costs") is not None)
+    replayed = Replayed(points, result.get("frontier"), style.colour, style.shown)
     shared, _ = log_sections(log, weights, replayed)
     title = f"{few(result['log']['tasks'])}: {len(learners)} selectors over {choices.order.shape[1]:,} decisions, {len(choices.order)} seeds"
     episodes = _episodes(log, weights, choices, names, style, options.scenes(log))
@@ -103,8 +98,6 @@ def _log(folder: Path, result: Mapping[str, Any], choices: Choices, log_folder: 
         raise UsageError(f"the log {source} that {folder} was replayed from is not there; give its folder with --log")
     encoder = result["log"]["encoder"]
     log = (read_live(source, encoder).outcomes if is_live_run(source) else read_log(source, encoder)).only(choices.policies)
-    if result.get("skills") is None:  # the selectors were not told
-        log = replace(log, skills=None)
     row = {key: index for index, key in enumerate(log.keys)}
     missing = [key for key in choices.instances if key not in row]
     if missing:
