@@ -24,7 +24,7 @@ test: $(READY)
 	$(ONE_THREAD) $(PYTHON) -m pytest -m "not slow" -n $(WORKERS) $(ARGS)
 
 slow: $(READY)
-	$(ONE_THREAD) $(PYTHON) -m pytest -m slow $(ARGS)
+	$(ONE_THREAD) $(PYTHON) -m pytest -m slow -n $(WORKERS) $(ARGS)
 
 lint: $(READY)
 	.venv/bin/ruff check .

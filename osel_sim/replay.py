@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli
-from osel_sim.errors import UnknownNameError, UsageError
+from osel_sim.errors import DataError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.offline.engine import Setup
@@ -144,7 +144,12 @@ def _replay(
             bar.total = total
             bar.update(made - bar.n)
 
-        result["frontier"] = selector_frontiers(log, setup, weights, learners, options.seeds, options.decisions, options.workers, show)
+        try:
+            result["frontier"] = selector_frontiers(log, setup, weights, learners, options.seeds, options.decisions, options.workers, show)
+        except DataError as error:
+            bar.close()
+            print(f"warning: no frontier of selectors: {error}", file=sys.stderr)
+            return
     write_replay(folder, result, choices, tables(result))
 
 

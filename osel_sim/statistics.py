@@ -12,12 +12,12 @@ Interval = tuple[float, float]
 """Low and high end."""
 
 
-def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> Interval:
+def wilson_interval(successes: float, trials: float, confidence: float = 0.95) -> Interval:
     """Wilson's score interval of a proportion. Holds its coverage for few trials and near 0 and 1, where the normal approximation does not.
 
     Args:
         successes: in [0, trials].
-        trials: with none, nothing is known: (0, 1).
+        trials: not whole where trials depend on one another (`effective_trials`); with none, nothing is known: (0, 1).
         confidence: in (0, 1).
 
     Raises:
@@ -36,6 +36,23 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> In
     low = 0.0 if successes == 0 else (centre - half) / scale
     high = 1.0 if successes == trials else (centre + half) / scale
     return low, high
+
+
+def effective_trials(rates: ArrayLike, trials: float) -> float:
+    """How many independent trials are worth as much as several on each of some instances, of which those on one instance are alike.
+
+    The number at which a binomial proportion would vary as the mean of the instances' rates does, but no fewer than there are instances and no more
+    than there were trials.
+
+    Args:
+        rates: (N,) share of successes on each instance.
+        trials: how many there were.
+    """
+    own = np.asarray(rates, np.float64).ravel()
+    rate, variance = float(own.mean()), float(own.var(ddof=1)) if own.size > 1 else 0.0
+    if rate in (0.0, 1.0) or variance == 0.0:
+        return float(own.size)
+    return float(np.clip(rate * (1.0 - rate) * own.size / variance, own.size, max(trials, own.size)))
 
 
 RESAMPLES = 10_000

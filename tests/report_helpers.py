@@ -56,7 +56,7 @@ def made_replay(folder: Path, log: LoggedOutcomes, seeds: int = 3) -> Path:
     best = oracles(complete, WEIGHTS)
     choices = with_fixed(choices, best)
     result = build(complete, WEIGHTS, None, choices, best, left_out, range(seeds))
-    slow, cheap = {"success": [0.9, 0.8, None], "seconds": [5.0, 4.0, None], "price": [3.0, 2.0, None]}, {"success": [0.7, 0.6, 0.5]}
+    slow, cheap = {"score": [0.9, 0.8, None], "seconds": [5.0, 4.0, None], "price": [3.0, 2.0, None]}, {"score": [0.7, 0.6, 0.5]}
     cheap |= {"seconds": [6.0, 6.0, 6.0], "price": [2.0, 1.0, 0.0]}
     result["frontier"] = {"seeds": 1, "decisions": len(complete)} | {
         axis: {"weights": [0.0, 0.1, 1.0], "selectors": {"ppo": entry}} for axis, entry in (("alpha_time", slow), ("alpha_price", cheap))

@@ -140,8 +140,8 @@ def test_frontier_runs_from_all_success_to_no_price(tmp_path):
     log = two_clusters(tmp_path)
     hindsight, by_cluster = frontiers(log, np.repeat([0, 1], 20), FREE, "alpha_price", 0.3)
     for frontier in (hindsight, by_cluster):
-        assert (frontier.success[0], frontier.price[0]) == (1.0, 5.0)
-        assert (frontier.success[-1], frontier.price[-1]) == (0.5, 0.0)
+        assert (frontier.score[0], frontier.price[0]) == (1.0, 5.0)
+        assert (frontier.score[-1], frontier.price[-1]) == (0.5, 0.0)
         assert (np.diff(frontier.price) <= 1e-9).all()
 
 

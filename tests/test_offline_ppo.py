@@ -80,6 +80,7 @@ def test_what_is_not_covered_goes_through_sb3():
     assert (replay_one("ppo", contexts, rewards, POLICIES, 3, **settings) == expected).all()
 
 
+@pytest.mark.slow
 def test_compiled_afresh_or_from_the_cache_it_is_the_same_to_the_bit(tmp_path):
     code = (
         "import hashlib, test_offline_ppo as tests\n"

@@ -111,6 +111,7 @@ def test_a_policy_added_to_a_log_or_to_half_a_recording_gives_the_bytes_of_all_a
         assert json.loads((place / "run.json").read_text())["configuration"] == json.loads((reference[0] / "run.json").read_text())["configuration"]
 
 
+@pytest.mark.slow
 def test_repeats_added_to_a_log_give_the_bytes_of_all_at_once(world, reference):
     folder = world / "repeated"
     assert execute(world, "record", "--instances", INSTANCES, "--start-seed", 40, "--out", folder).returncode == 0
@@ -130,6 +131,7 @@ def test_repeats_added_to_a_log_give_the_bytes_of_all_at_once(world, reference):
     assert files(folder) == files(reference[0])
 
 
+@pytest.mark.slow
 def test_contexts_of_another_encoder_are_added(world, reference):
     folder = world / "encoded"
     shutil.copytree(reference[0], folder)

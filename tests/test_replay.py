@@ -136,7 +136,7 @@ def test_the_frontier_follows_the_price(tmp_path: Path, capsys):
         assert found[axis]["weights"][0] == 0 and np.all(np.diff(found[axis]["weights"]) > 0)
         assert set(found[axis]["selectors"]) == {"linucb"}
     own = found["alpha_price"]["selectors"]["linucb"]
-    assert own["price"][0] > 4 > own["price"][-1] == 0 and own["success"][0] > 0.9 > own["success"][-1] == pytest.approx(0.5, abs=0.15)
+    assert own["price"][0] > 4 > own["price"][-1] == 0 and own["score"][0] > 0.9 > own["score"][-1] == pytest.approx(0.5, abs=0.15)
     assert min(own["price"]) < 6 and own["seconds"][0] > own["seconds"][-1]
     with (tmp_path / "out" / "frontier.csv").open() as file:
         rows = list(csv.DictReader(file))

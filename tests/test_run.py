@@ -229,6 +229,7 @@ def one_line(capsys) -> str:
     return text
 
 
+@pytest.mark.slow
 def test_tensorboard_files_have_each_decision_once_after_a_resume(world):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="tensorboard is not installed")
     folder = world / "board"

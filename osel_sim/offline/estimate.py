@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from osel_sim.statistics import bootstrap_mean_interval, wilson_interval
+from osel_sim.statistics import bootstrap_mean_interval, effective_trials, wilson_interval
 
 if TYPE_CHECKING:
     from osel_sim.offline.log import Array
@@ -35,14 +35,15 @@ def mean_of(values: ArrayLike) -> Estimate | None:
 def rate_of(outcomes: "Array") -> Estimate | None:
     """Share of successes among the outcomes (N, R) that are not NaN; None of nothing.
 
-    Wilson's interval where each instance was tried once; with repeats, which are no independent trials, or with graded outcomes a bootstrap over
-    instances.
+    Wilson's interval, with as many trials as the repeats of an instance, which are no independent trials, are worth; with graded outcomes a bootstrap
+    over instances. The rate is that of the mean instance, so that one with more repeats does not weigh more.
     """
     known = outcomes[np.isfinite(outcomes).any(axis=-1)]
     if not known.size:
         return None
+    finite = np.isfinite(known)
     per_instance = np.nanmean(known, axis=-1)
-    if np.isfinite(known).sum() == len(known) and np.isin(per_instance, (0.0, 1.0)).all():
-        return Estimate(float(per_instance.mean()), *wilson_interval(int(per_instance.sum()), len(per_instance)))
-    # The rate is that of the mean instance, so that one with more repeats does not weigh more.
-    return mean_of(per_instance)
+    if not np.isin(known[finite], (0.0, 1.0)).all():
+        return mean_of(per_instance)
+    rate, trials = float(per_instance.mean()), effective_trials(per_instance, float(finite.sum()))
+    return Estimate(rate, *wilson_interval(min(rate * trials, trials), trials))

@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import DataError
-from osel_sim.offline.clusters import complete_instances, find_clusters
+from osel_sim.offline.clusters import find_clusters, score_of
 from osel_sim.offline.engine import Setup, replay
 from osel_sim.offline.log import Array, LoggedOutcomes, mean_over_repeats
-from osel_sim.offline.weights_map import AXES, Axis, limits, moved
+from osel_sim.offline.weights_map import Axis, limits, moved, swept
 from osel_sim.selection.reward import RewardWeights
 
 _POINTS = 49
@@ -19,8 +18,6 @@ _REPLAYED = 6
 """Weights at which selectors are replayed: a replay takes seconds where an oracle takes none."""
 _DECISIONS = 1_000
 _SEEDS_FOR_EACH = 10
-
-MEASURED = ("success", "seconds", "price")
 
 Chooser = Callable[[Array], NDArray[np.int64]]
 """Of rewards (N, P): the column chosen for each instance, (N,)."""
@@ -33,14 +30,19 @@ class Frontier:
     Attributes:
         name: `hindsight oracle`, or `best policy of each cluster`.
         weights: (K,) the weight that sweeps; the other is as given.
-        success, seconds, price: (K,) means over the instances.
+        score, seconds, price: (K,) means over the instances; the score is what the reward counts as success.
     """
 
     name: str
     weights: Array
-    success: Array
+    score: Array
     seconds: Array
     price: Array
+
+
+def measured(log: LoggedOutcomes, weights: RewardWeights) -> dict[str, Array]:
+    """What a frontier shows of every episode, (N, P, R) each."""
+    return {"score": score_of(log, weights), "seconds": log.seconds, "price": log.price}
 
 
 def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWeights, sweep: Axis, high: float) -> list[Frontier]:
@@ -54,19 +56,19 @@ def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWei
         sweep: which weight.
         high: up to where, from a ten-thousandth of it, and 0.
     """
-    complete = complete_instances(log, weights)
-    part = log.take(complete)
-    own, first = labels[complete], part.first_half()
-    swept = np.concatenate([[0.0], np.geomspace(high / 10_000, high, _POINTS - 1)])
-    tables = [mean_over_repeats(getattr(part, name)) for name in MEASURED]
+    rows = swept(log, weights).rows
+    part, own = log.take(rows), labels[rows]
+    first = part.first_half()
+    values = np.concatenate([[0.0], np.geomspace(high / 10_000, high, _POINTS - 1)])
+    tables = [mean_over_repeats(table) for table in measured(part, weights).values()]
     choosers: dict[str, Chooser] = {"hindsight oracle": lambda rewards: rewards.argmax(axis=1)}
     if first.any() and not first.all():
         choosers["best policy of each cluster"] = lambda rewards: _by_cluster(rewards, own, first)
     found = []
     for name, choose in choosers.items():
-        columns = [choose(part.mean_rewards(moved(weights, sweep, float(value)))) for value in swept]
-        rows = np.arange(len(part))
-        found.append(Frontier(name, swept, *(np.array([_mean(table[rows, chosen]) for chosen in columns]) for table in tables)))
+        columns = [choose(part.mean_rewards(moved(weights, sweep, float(value)))) for value in values]
+        every = np.arange(len(part))
+        found.append(Frontier(name, values, *(np.array([_mean(table[every, chosen]) for chosen in columns]) for table in tables)))
     return found
 
 
@@ -79,7 +81,7 @@ def selector_frontiers(
     decisions: int | None,
     workers: int,
     progress: Callable[[int, int], Any],
-) -> dict[str, Any] | None:
+) -> dict[str, Any]:
     """Frontiers of selectors that learn, replayed anew at each of a few weights: means over the last quarter of their streams.
 
     Args:
@@ -90,34 +92,32 @@ def selector_frontiers(
         progress: called with a number of decisions made, and that of all there will be.
 
     Returns:
-        seeds, decisions, and of each weight that something in the log hangs on: weights [K] from 0, selectors {name: {success, seconds, price: [K],
-        None where unknown}}. None where there are too few instances to say up to where to look.
+        seeds, decisions, and of each weight that can be moved: weights [K] from 0, selectors {name: {score, seconds, price}}, [K] each, None where
+        unknown.
+
+    Raises:
+        DataError: there are too few instances for clusters, which say up to where to look.
     """
-    try:
-        ends = limits(log, find_clusters(log.contexts).labels, weights)
-    except DataError:
-        return None
+    ends = limits(log, find_clusters(log.contexts).labels, weights)
+    part = log.take(swept(log, weights).rows)
     streams = range(max(1, seeds // _SEEDS_FOR_EACH))
-    length = min(len(log) if decisions is None else decisions, _DECISIONS)
-    axes = [axis for axis, values in zip(AXES, (log.seconds, log.price), strict=True) if np.isfinite(values).any()]
+    length = min(len(part), _DECISIONS, decisions or _DECISIONS)
+    late = slice(length * 3 // 4, None)
+    tables = measured(part, weights)
     found: dict[str, Any] = {"seeds": len(streams), "decisions": length}
-    made = 0
+    total, made = len(ends) * _REPLAYED * len(selectors) * len(streams) * length, 0
 
     def count(number: int) -> None:
         nonlocal made
         made += number
         progress(made, total)
 
-    total = len(axes) * _REPLAYED * len(selectors) * len(streams) * length
-    for axis in axes:
-        swept = np.concatenate([[0.0], np.geomspace(ends[axis] / 300, ends[axis], _REPLAYED - 1)])
-        part = log.take(complete_instances(log, moved(weights, axis, ends[axis])))
-        late = slice(min(length, len(part)) * 3 // 4, None)
-        setups = [setup(moved(weights, axis, float(value))) for value in swept]
-        choices = replay(part, setups, selectors, streams, min(length, len(part)), workers, count)
-        tables = {name: getattr(part, name) for name in MEASURED}
+    for axis, high in ends.items():
+        values = np.concatenate([[0.0], np.geomspace(high / 300, high, _REPLAYED - 1)])
+        setups = [setup(moved(weights, axis, float(value))) for value in values]
+        choices = replay(part, setups, selectors, streams, length, workers, count)
         found[axis] = {
-            "weights": swept.tolist(),
+            "weights": values.tolist(),
             "selectors": {
                 selector: {name: [_known(_mean(own.received(selector, table)[:, late])) for own in choices] for name, table in tables.items()}
                 for selector in selectors

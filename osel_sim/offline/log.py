@@ -147,7 +147,7 @@ class LoggedOutcomes:
         first = self.half("choose")
         if first.any() and not first.all():
             return first
-        return np.random.default_rng(0).permutation(len(self)) % 2 == 0
+        return np.asarray(np.random.default_rng(0).permutation(len(self)) % 2 == 0, bool)
 
     def labels(self, attribute: str) -> tuple[str, ...]:
         """An attribute of every instance (`task`, `target`, `phrasing` ...) as text, (N,); empty where the log does not have it."""

@@ -15,6 +15,9 @@ from osel_sim.statistics import RESAMPLES, Interval, bootstrap_mean_interval, bo
 LATE = 0.25
 """The share of a stream's decisions that counts as late."""
 
+NOT_APART = 0.025
+"""Of so many bootstrap draws without a gap on, its share has no interval: it is not bounded."""
+
 
 @dataclass(frozen=True)
 class Curves:
@@ -41,7 +44,7 @@ class Curves:
 
     def interval(self, oracle: str, values: Array) -> Interval:
         """95 % bootstrap interval of the mean of values (S, T) that an oracle's rewards went into: over seeds and what the oracle may be off."""
-        low, high = np.quantile(bootstrap_means(values.mean(axis=1)) + self.errors(oracle), [0.025, 0.975])
+        low, high = np.quantile(bootstrap_means(units(values)) + self.errors(oracle), [0.025, 0.975])
         return float(low), float(high)
 
 
@@ -69,6 +72,11 @@ def curves(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: 
     return Curves(received, found, best.learnable, decisions - max(1, int(decisions * LATE)), errors)
 
 
+def units(values: Array) -> Array:
+    """What is drawn anew for an interval of the mean of values (S, T): the seeds' means; of a single seed its decisions."""
+    return np.asarray(values.mean(axis=1) if len(values) > 1 else values[0], np.float64)
+
+
 def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -> dict[str, Any]:
     """One selector: what `replay.json` says about it under `selectors`."""
     received = rewards.selectors[name]
@@ -79,10 +87,10 @@ def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -
     successes = choices.received(name, log.success)
     return {
         "mean_reward": float(received.mean()),
-        "ci95": list(bootstrap_mean_interval(received.mean(axis=1))),
+        "ci95": list(bootstrap_mean_interval(units(received))),
         "mean_reward_late": float(received[:, late].mean()),
         "success_rate": got["success"],
-        "success_ci95": list(bootstrap_mean_interval(successes.mean(axis=1))) if got["success"] is not None else None,
+        "success_ci95": list(bootstrap_mean_interval(units(successes))) if got["success"] is not None else None,
         "mean_subgoals": got["subgoals"],
         "mean_steps": got["steps"],
         "mean_seconds": got["seconds"],
@@ -100,26 +108,24 @@ def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -
     }
 
 
-def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tuple[float, Interval] | None:
+def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tuple[float, Interval | None] | None:
     """Share of the gap to an oracle closed from decision `first` on, with its 95 % bootstrap interval over seeds and, for the expected oracle, over
     the instances with repeats that it was measured on.
 
     (selector - best single) / (oracle - best single), all averaged over seeds and decisions. None where the oracle is not better than the best
-    single policy, so that there is no gap to close.
+    single policy, so that there is no gap to close; no interval where it may well not be: more than `NOT_APART` of the draws have no gap.
     """
-    base = rewards.oracles["best_single"][:, first:].mean(axis=1)
-    gains = received[:, first:].mean(axis=1) - base
-    gaps = rewards.oracles[oracle][:, first:].mean(axis=1) - base
+    base = rewards.oracles["best_single"][:, first:]
+    gains, gaps = units(received[:, first:] - base), units(rewards.oracles[oracle][:, first:] - base)
     if gaps.mean() <= 0.0:
         return None
-    generator = np.random.default_rng(0)
-    rows = generator.integers(len(gains), size=(RESAMPLES, len(gains)))
-    below = gaps[rows].mean(axis=1) + rewards.errors(oracle)
-    shares = np.where(below > 0.0, gains[rows].mean(axis=1) / np.where(below > 0.0, below, 1.0), np.nan)
-    if not np.isfinite(shares).all():
-        return None
-    low, high = np.quantile(shares, [0.025, 0.975])
-    return float(gains.mean() / gaps.mean()), (float(low), float(high))
+    share = float(gains.mean() / gaps.mean())
+    # The same seed draws the same units for both.
+    above, below = bootstrap_means(gains), bootstrap_means(gaps) + rewards.errors(oracle)
+    if (below <= 0.0).mean() > NOT_APART:
+        return share, None
+    low, high = np.quantile(above[below > 0.0] / below[below > 0.0], [0.025, 0.975])
+    return share, (float(low), float(high))
 
 
 def until_ahead(differences: Array) -> int | None:
@@ -144,8 +150,8 @@ def paired(rewards: Curves, names: Sequence[str]) -> list[dict[str, Any]]:
     result = []
     for index, one in enumerate(names):
         for other in names[index + 1 :]:
-            difference = (rewards.selectors[one] - rewards.selectors[other]).mean(axis=1)
-            late = (rewards.selectors[one] - rewards.selectors[other])[:, rewards.late :].mean(axis=1)
+            apart = rewards.selectors[one] - rewards.selectors[other]
+            difference, late = units(apart), units(apart[:, rewards.late :])
             result.append(
                 {
                     "a": one,
@@ -159,8 +165,9 @@ def paired(rewards: Curves, names: Sequence[str]) -> list[dict[str, Any]]:
     return result
 
 
-def _gap_entries(name: str, found: tuple[float, Interval] | None) -> dict[str, Any]:
-    return {name: None if found is None else found[0], f"{name}_ci95": None if found is None else list(found[1])}
+def _gap_entries(name: str, found: tuple[float, Interval | None] | None) -> dict[str, Any]:
+    share, interval = found or (None, None)
+    return {name: share, f"{name}_ci95": None if interval is None else list(interval)}
 
 
 def _mean(values: Array) -> float | None:

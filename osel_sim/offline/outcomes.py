@@ -99,7 +99,7 @@ def remote_policies(log: LoggedOutcomes) -> tuple[NDArray[np.bool_], str]:
 
 
 def outcome_rates(log: LoggedOutcomes, remote: NDArray[np.bool_], attribute: str = "task") -> list[OutcomeRates]:
-    """Table I for all instances and each task. Repeat r of a local policy is paired with repeat r of the remote ones; pairs with a gap are left out.
+    """Table I for all instances and each task. Valid repeats of local and remote policies are paired in their order; the rest is left out.
 
     Args:
         remote: (P,) which policies are remote; the paper has one local policy, several count as one that succeeds if any does.
@@ -114,6 +114,8 @@ def rates_of(group: str, success: Array, remote: NDArray[np.bool_]) -> OutcomeRa
         success: (N, P, R), NaN where there is no outcome.
         remote: (P,).
     """
+    # Repeats are as good as one another: the first valid one of a policy goes with the first of the others, whatever their numbers.
+    success = np.take_along_axis(success, np.argsort(~np.isfinite(success), axis=2, kind="stable"), axis=2)
     local_success, remote_success = success[:, ~remote].max(axis=1), success[:, remote].max(axis=1)  # NaN wherever one of them is
     known = np.isfinite(local_success) & np.isfinite(remote_success)
     instances = known.any(axis=-1)

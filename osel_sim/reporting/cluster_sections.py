@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from osel_sim.offline.clusters import Cluster, Clustering, Inequality, describe, find_clusters, inequality
 from osel_sim.offline.estimate import mean_of
-from osel_sim.offline.frontier import frontiers
+from osel_sim.offline.frontier import frontiers, measured
 from osel_sim.offline.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.offline.weights_map import Axis, TrivialRange, trivial_ranges, weights_map
 from osel_sim.reporting.description import Bars, Cell, Column, Figure, Heat, Line, Mark, Panel, Points, Table, colours
+from osel_sim.reporting.log_sections import score_label
 from osel_sim.reporting.tables import to_text
 from osel_sim.selection.reward import PRESETS, RewardWeights
 
@@ -27,7 +28,7 @@ class Replayed:
     """What the frontier shows of selectors.
 
     Attributes:
-        points: success, seconds and price of each at the weights given.
+        points: score, seconds and price of each at the weights given.
         swept: what they came to at others, as `osel_sim.offline.frontier.selector_frontiers` gives it; None where that was not replayed.
         colour: of each.
         shown: those drawn without being asked for.
@@ -70,7 +71,11 @@ def cluster_blocks(log: LoggedOutcomes, routing: Routing) -> list[str | Figure |
 
 def weights_blocks(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[np.bool_], routing: Routing) -> list[str | Figure | Table]:
     """Where routing is trivial, as a map over both weights and as ranges of each."""
+    if not routing.ranges:
+        return ["The log has neither times nor prices of every policy, so there is nothing to weigh success against."]
     found = weights_map(log, routing.clustering.labels, weights, remote)
+    if found is None:
+        return [_ranges_table(weights, routing.ranges)]
     x, y, xs, ys = "alpha_time", "alpha_price (per cent)", found.alpha_time, found.alpha_price
     inside = {
         name: other
@@ -93,34 +98,38 @@ def weights_blocks(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[
         Panel("what routing by cluster adds", x, y, [gain, *points], True, True),
     ]
     caption = (
-        "Left: all blue and all red are the trivial regions, where every cluster wants a local or a remote policy. Right: best policy of each "
-        "cluster minus best policy of all, chosen and scored on the same instances. Star: the weights of this report; diamonds: the paper's presets."
+        "Left: all blue and all red are the paper's trivial regions, where every cluster wants a local or a remote policy. Right: best policy of "
+        "each cluster minus best policy of all, chosen and scored on the same instances; with several remote policies choosing among them can pay "
+        "where all want a remote one. Star: the weights of this report; diamonds: the paper's presets."
     )
     return [Figure("weights_map", "When is routing trivial?", caption, panels), _ranges_table(weights, routing.ranges)]
 
 
-def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routing, replayed: Replayed) -> Figure:
-    """Success against seconds and against price as a weight sweeps."""
-    tables = {name: _policy_means(getattr(log, name)) for name in ("success", "seconds", "price")}
-    own = colours(log.policies)
+def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routing, replayed: Replayed) -> Figure | None:
+    """Success against seconds and against price as a weight sweeps; None where the log has neither."""
+    tables = {name: _policy_means(table) for name, table in measured(log, weights).items()}
+    own, label, scale = colours(log.policies), *score_label(weights)
     panels = []
-    for found, against, label in zip(routing.ranges, ("seconds", "price"), ("mean seconds", "mean price (cents)"), strict=True):
+    for found in routing.ranges:
+        against, x_label = ("seconds", "mean seconds") if found.axis == "alpha_time" else ("price", "mean price (cents)")
         if not np.isfinite(tables[against]).any():
-            continue  # a log from elsewhere without times, or prices
+            continue  # time may be counted in steps, of a log without seconds
         other = "alpha_price" if found.axis == "alpha_time" else "alpha_time"
         marks: list[Mark] = []
         for frontier, dash in zip(frontiers(log, routing.clustering.labels, weights, found.axis, found.limit), (True, False), strict=False):
             x, texts = getattr(frontier, against), [f"{found.axis} {value:.3g}" for value in frontier.weights]
-            marks.append(Line(frontier.name, x, 100 * frontier.success, "ink", dash=dash, dots=True, texts=texts))
+            marks.append(Line(frontier.name, x, scale * frontier.score, "ink", dash=dash, dots=True, texts=texts))
         for column, policy in enumerate(log.policies):
             if np.isfinite(tables[against][column]):
                 marks.append(
-                    Points(f"always {policy}", [tables[against][column]], [100 * tables["success"][column]], own[policy], size=11, symbol="diamond")
+                    Points(f"always {policy}", [tables[against][column]], [scale * tables["score"][column]], own[policy], size=11, symbol="diamond")
                 )
         for name in replayed.points:
-            marks += _selector_marks(name, found.axis, against, replayed)
+            marks += _selector_marks(name, found.axis, against, scale, replayed)
         title = f"{found.axis} from 0 to {found.limit:.2g}, {other} = {getattr(weights, other):g}"
-        panels.append(Panel(title, label, "success (%)", marks))
+        panels.append(Panel(title, x_label, label, marks))
+    if not panels:
+        return None
     caption = (
         "Black: what the hindsight oracle (dashed), and the best policy of each cluster (chosen on one half of the instances, scored on the other), "
         "come to as one weight sweeps. Up and to the left is better."
@@ -131,20 +140,20 @@ def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routin
         caption += (
             f" Their lines: replayed at other weights, in {replayed.swept['seeds']} streams of {replayed.swept['decisions']:,} decisions at each."
         )
-    return Figure("frontier", "Frontier: success against time and price", caption, panels)
+    return Figure("frontier", f"Frontier: {label.partition(' (')[0]} against time and price", caption, panels)
 
 
-def _selector_marks(name: str, axis: Axis, against: str, replayed: Replayed) -> list[Mark]:
+def _selector_marks(name: str, axis: Axis, against: str, scale: float, replayed: Replayed) -> list[Mark]:
     """A selector on the frontier: a line where it was replayed at other weights, and a dot at these."""
     colour, shown, values = replayed.colour.get(name, "muted"), name in replayed.shown, replayed.points[name]
     marks: list[Mark] = []
     swept = (replayed.swept or {}).get(axis)
     if swept and name in swept["selectors"]:
-        line = {key: np.array(swept["selectors"][name][key], np.float64) for key in ("success", against)}  # None becomes NaN
+        line = {key: np.array(swept["selectors"][name][key], np.float64) for key in ("score", against)}  # None becomes NaN
         texts = [f"{name}, {axis} {value:.3g}" for value in swept["weights"]]
-        marks.append(Line(name, line[against], 100 * line["success"], colour, dots=True, texts=texts, shown=shown))
-    if against in values and "success" in values:
-        marks.append(Points(name, [values[against]], [100 * values["success"]], colour, size=9, shown=shown))
+        marks.append(Line(name, line[against], scale * line["score"], colour, dots=True, texts=texts, shown=shown))
+    if against in values and "score" in values:
+        marks.append(Points(name, [values[against]], [scale * values["score"]], colour, size=9, shown=shown))
     return marks
 
 
@@ -239,18 +248,28 @@ def _ranges_table(weights: RewardWeights, ranges: list[TrivialRange]) -> Table:
     rows: list[dict[str, Cell]] = []
     for found in ranges:
         other = "alpha_price" if found.axis == "alpha_time" else "alpha_time"
-        rows.append(
-            {
-                **{"weight": found.axis, "here": float(getattr(weights, found.axis)), "kept": f"{other} = {getattr(weights, other):g}"},
-                "remote": "never" if found.all_remote_below is None else f"0 to {to_text(found.all_remote_below, number)}",
-                "local": f"not up to {found.limit:.3g}" if found.all_local_above is None else f"from {to_text(found.all_local_above, number)}",
-            }
-        )
+        alone = [f"{policy}: {to_text(low, number)} to {to_text(high, number)}" for policy, low, high in found.one_policy]
+        for formula, below, above in (
+            ("plain expectation", found.all_remote_below, found.all_local_above),
+            ("paper's formula (1 \u2212 p_FS)", found.paper_all_remote_below, found.paper_all_local_above),
+        ):
+            rows.append(
+                {
+                    **{"weight": found.axis, "here": float(getattr(weights, found.axis)), "kept": f"{other} = {getattr(weights, other):g}"},
+                    **{"formula": formula, "remote": "never" if below is None else f"0 to {to_text(below, number)}"},
+                    "local": f"not up to {found.limit:.3g}" if above is None else f"from {to_text(above, number)}",
+                    "alone": "" if formula != "plain expectation" else "; ".join(alone) or "nowhere",
+                }
+            )
     columns = [
         *(Column("weight", "weight", "text"), Column("here", "in this report", digits=4), Column("kept", "other weight kept at", "text")),
-        *(Column("remote", "every cluster remote", "text"), Column("local", "every cluster local", "text")),
+        *(Column("formula", "computed as", "text"), Column("remote", "every cluster remote", "text"), Column("local", "every cluster local", "text")),
+        Column("alone", "same policy in every cluster", "text"),
     ]
-    caption = "Between the two ranges some clusters want a local and some a remote policy, and a contextual selector has something to gain."
+    caption = (
+        "Between the first two ranges some clusters want a local and some a remote policy. A contextual selector has nothing to gain only where one "
+        "and the same policy is best in every cluster: with several remote policies that is less than where all are remote."
+    )
     return Table("trivial_weights", "Ranges in which routing is trivial", caption, columns, rows)
 
 

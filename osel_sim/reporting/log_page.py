@@ -56,8 +56,9 @@ def log_sections(log: LoggedOutcomes, weights: RewardWeights, replayed: Replayed
     sections = [Section("policies", "Policies", [*policies, *([times] if times else [])])]
     if routing is not None:
         frontier = frontier_figure(log, weights, routing, replayed or Replayed())
+        weighed: list[Block] = [*weights_blocks(log, weights, remote, routing), *([frontier] if frontier else [])]
         sections += [
-            Section("weights", "Time, price and success", [*weights_blocks(log, weights, remote, routing), frontier]),
+            Section("weights", "Time, price and success", weighed),
             Section("clusters", "What the context tells", cluster_blocks(log, routing)),
         ]
     elif several:

@@ -26,6 +26,11 @@ def formula(weights: RewardWeights) -> str:
     return f"reward = {score} \u2212 {weights.alpha_time:g} · {time} \u2212 {weights.alpha_price:g} · cents"
 
 
+def score_label(weights: RewardWeights) -> tuple[str, float]:
+    """What the reward counts as success as the label of an axis, and by what to multiply it."""
+    return {"success": ("success (%)", 100.0), "subgoals": ("subgoals done (%)", 100.0), "score": ("score", 1.0)}[weights.success]
+
+
 def policy_blocks(log: LoggedOutcomes, weights: RewardWeights) -> list[Figure | Table]:
     """Success and reward of each policy by task, and by what was asked where the log knows (paper, figures 3 and 4)."""
     blocks: list[Figure | Table] = [
@@ -121,7 +126,8 @@ def _policy_table(name: str, title: str, results: Sequence[PolicyResult]) -> Tab
         *(Column("success", "success", "percent"), Column("reward", "mean reward", digits=3)),
         *(Column("steps", "steps", digits=0), Column("seconds", "seconds"), Column("price", "price (cents)", digits=1)),
     ]
-    caption = "Means with 95% intervals: Wilson's for success, a bootstrap over instances for the others. Errors count nowhere else."
+    caption = "Means with 95% intervals: Wilson's for success, in which repeats of an instance count for what they tell; for the others a bootstrap "
+    caption += "over instances. Errors count nowhere else."
     return Table(name, title, caption, columns, [{key: getattr(result, key) for key in keys} for result in results])
 
 

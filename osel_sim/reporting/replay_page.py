@@ -1,7 +1,7 @@
 """The page of a replay."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -76,9 +76,9 @@ def _page(folder: Path, result: Mapping[str, Any], choices: Choices, options: Re
     learnable = ORACLES[result["learnable_oracle"]["name"]]
     selectors: list[Block] = [curve_figure(streams, style), selector_table(result, names)]
     gap = gap_figure({names[name]: gaps(entry) for name, entry in result["selectors"].items() if entry["kind"] == "learner"}, learnable)
-    regret = regret_figure(streams, [*_ends(result, names)[:1], learnable], style)
+    regret = regret_figure(streams, [*_ends(result, names)[:1], *(word for word in ORACLES.values() if word in streams)], style)
     shares = share_figure(learners, log.policies, style)
-    selectors += [block for block in (gap, regret, penalty_figure(streams, style), shares) if block is not None]
+    selectors += [block for block in (gap, regret, penalty_figure(streams, weights, style), shares) if block is not None]
     selectors += [oracle_table(result), *paired_tables(result, names)]
     selectors += [off_policy_table(result["off_policy"])] if result.get("off_policy") else []
     points = {shown: _point(streams[shown]) for name, shown in names.items() if not name.startswith("fixed:")}
@@ -127,13 +127,13 @@ def _ends(result: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
 def _streams(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str]) -> dict[str, Stream]:
     """What every selector and oracle received in each decision."""
     rewards = log.rewards(weights)
-    penalties = score_of(log, weights) - rewards
-    tables = [choices.outcomes(table) for table in (rewards, log.success, penalties, log.seconds, log.price)]
+    score = score_of(log, weights)
+    tables = [choices.outcomes(table) for table in (rewards, log.success, score, score - rewards, log.seconds, log.price)]
 
     def stream(columns: Array) -> Stream:
         chosen = columns.astype(np.int64)
-        reward, success, penalty, seconds, price = (np.take_along_axis(table, chosen[:, :, None], axis=2)[:, :, 0] for table in tables)
-        return Stream(reward, success, penalty, seconds, price, chosen)
+        reward, success, score, penalty, seconds, price = (np.take_along_axis(table, chosen[:, :, None], axis=2)[:, :, 0] for table in tables)
+        return Stream(reward, success, score, penalty, seconds, price, chosen)
 
     streams = {shown: stream(choices.chosen[name].astype(np.float64)) for name, shown in names.items()}
     found = curves(log, weights, choices, oracles(log, weights))
@@ -141,18 +141,16 @@ def _streams(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, name
     for name, shown in ORACLES.items():
         if name == "hindsight":
             best = stream(np.nan_to_num(tables[0], nan=-np.inf).argmax(axis=2).astype(np.float64))
-            streams[shown] = Stream(best.reward, best.success, best.penalty, best.seconds, best.price)
+            streams[shown] = replace(best, chosen=None)
         elif name in found.oracles:
-            streams[shown] = Stream(found.oracles[name], nothing, nothing, nothing, nothing)
+            streams[shown] = Stream(found.oracles[name], *[nothing] * 5)
     return streams
 
 
 def _point(stream: Stream) -> dict[str, float]:
-    """Success, seconds and price over the last quarter of the stream: what it comes to once it has learnt."""
+    """Score, seconds and price over the last quarter of the stream: what it comes to once it has learnt."""
     late = slice(stream.reward.shape[1] * 3 // 4, None)
-    return {
-        name: float(np.nanmean(values)) for name in ("success", "seconds", "price") if np.isfinite(values := getattr(stream, name)[:, late]).any()
-    }
+    return {name: float(np.nanmean(values)) for name in ("score", "seconds", "price") if np.isfinite(values := getattr(stream, name)[:, late]).any()}
 
 
 def _verdict(result: Mapping[str, Any]) -> Verdict:

@@ -11,14 +11,16 @@ SINGLES = ("best_single", "worst_single")
 """Second names of the fixed policies with the highest and the lowest mean reward."""
 
 
-def gaps(entry: Mapping[str, Any]) -> tuple[Estimate | None, Estimate | None]:
+def gaps(entry: Mapping[str, Any]) -> tuple[Estimate | float | None, Estimate | float | None]:
     """Share of the learnable gap a selector closed, over the whole stream and its last quarter."""
     return _estimate(entry, "learnable_gap_closed"), _estimate(entry, "learnable_gap_closed_late")
 
 
-def _estimate(entry: Mapping[str, Any], key: str, interval: str | None = None) -> Estimate | None:
+def _estimate(entry: Mapping[str, Any], key: str, interval: str | None = None) -> Estimate | float | None:
     value, ends = entry.get(key), entry.get(interval or f"{key}_ci95")
-    return None if value is None or ends is None else Estimate(float(value), float(ends[0]), float(ends[1]))
+    if value is None or ends is None:
+        return value
+    return Estimate(float(value), float(ends[0]), float(ends[1]))
 
 
 def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table:
@@ -56,7 +58,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
         Column("ahead", "ahead after"),
     ]
     caption = (
-        "Means with 95% bootstrap intervals over seeds, the best first; those of the gap also over what the expected oracle may be off. "
+        f"{_over_seeds(result)} The best first. Those of the gap are also over what the expected oracle may be off; a gap without one may be none. "
         "Regret: reward a decision below the oracle. Gap closed: share of the way "
         f"from the best single policy to the learnable oracle{'' if predictable else ', in the last quarter also to the predictable one'}. "
         "Ahead after: decisions until its rewards pass the best single policy's for good."
@@ -114,12 +116,21 @@ def paired_tables(result: Mapping[str, Any], names: Mapping[str, str]) -> list[T
         *(Column("selector", "selector", "text"), Column("against", "against", "text")),
         *(Column("difference", "difference in reward", digits=4), Column("late", "in the last quarter", digits=4)),
     ]
-    caption = "Differences on the same streams, with 95% bootstrap intervals over seeds; paired.csv of the replay has all pairs."
+    caption = f"Differences on the same streams; paired.csv of the replay has all pairs. {_over_seeds(result)}"
     return [Table("paired_differences", "Paired differences", caption, columns, rows)]
 
 
-def _signed(estimate: Estimate | None, sign: float) -> Estimate | None:
-    if estimate is None or sign > 0:
+def _over_seeds(result: Mapping[str, Any]) -> str:
+    """What the intervals say."""
+    if len(result["seeds"]) == 1:
+        return "Means with 95% bootstrap intervals over the decisions of the only seed."
+    return "Means with 95% bootstrap intervals over seeds: what another order of the same instances would change, not what other instances would."
+
+
+def _signed(estimate: Estimate | float | None, sign: float) -> Estimate | float | None:
+    if not isinstance(estimate, Estimate):
+        return estimate and sign * estimate
+    if sign > 0:
         return estimate
     return Estimate(-estimate.value, -estimate.high, -estimate.low)
 

@@ -48,7 +48,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     style = style_of(list(streams), run.log.policies, {f"always {policy}": policy for policy in run.log.policies})
     curves: list[Block] = [curve_figure(streams, style)]
     if HINDSIGHT in streams:
-        curves += [regret_figure(streams, [HINDSIGHT], style), penalty_figure(streams, style)]
+        curves += [regret_figure(streams, [HINDSIGHT], style), penalty_figure(streams, run.weights, style)]
     shares = share_figure({selector: streams[selector]}, run.log.policies, style)
     curves += [shares] if shares else []
     curves += [_propensities(run), _chosen_table(run, selector)]
@@ -99,13 +99,12 @@ def _streams(run: _Run, selector: str) -> dict[str, Stream]:
     """The selector, and where every policy ran in a decision what each would have received there, and the best of them."""
     rows, log = np.arange(len(run.chosen)), run.log
     rewards = log.mean_rewards(run.weights)
-    score = log.success[:, :, 0]
-    penalty = score_of(log, run.weights)[:, :, 0] - rewards
-    tables = np.stack([rewards, score, penalty, log.seconds[:, :, 0], log.price[:, :, 0]])
+    score = score_of(log, run.weights)[:, :, 0]
+    tables = np.stack([rewards, log.success[:, :, 0], score, score - rewards, log.seconds[:, :, 0], log.price[:, :, 0]])
 
     def stream(received: Array, chosen: NDArray[np.int64] | None = None) -> Stream:
-        reward, success, lost, seconds, price = received[:, None, :]
-        return Stream(reward, success, lost, seconds, price, chosen)
+        reward, success, own, lost, seconds, price = received[:, None, :]
+        return Stream(reward, success, own, lost, seconds, price, chosen)
 
     streams = {selector: stream(tables[:, rows, run.chosen], run.chosen[None])}
     complete = np.isfinite(rewards).all(axis=1)

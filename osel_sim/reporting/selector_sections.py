@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from osel_sim.offline.estimate import Estimate, mean_of, rate_of
 from osel_sim.offline.log import Array
 from osel_sim.reporting.description import Bars, Figure, Line, Mark, Panel, Points, colours, thinned
+from osel_sim.reporting.log_sections import score_label
+from osel_sim.selection.reward import RewardWeights
 
 MAIN = ("auto:warm", "auto", "ppo", "ppo_tuned", "epsilon_greedy", "random")
 """Of many selectors, those drawn without being asked for: the recommended one, and those of the paper's figure 5."""
@@ -36,12 +38,14 @@ class Stream:
     """What one way of choosing received. S seeds (1 in a live run), T decisions; NaN where it is not known.
 
     Attributes:
-        reward, success, penalty, seconds, price: (S, T); penalty is alpha_time time + alpha_price price.
+        reward, success, score, penalty, seconds, price: (S, T); the score is what the reward counts as success, the penalty alpha_time time +
+            alpha_price price.
         chosen: (S, T) column of the policy; None for what chooses none.
     """
 
     reward: Array
     success: Array
+    score: Array
     penalty: Array
     seconds: Array
     price: Array
@@ -100,21 +104,22 @@ def regret_figure(streams: Mapping[str, Stream], references: Sequence[str], styl
     return Figure("regret", "Regret", caption, panels)
 
 
-def penalty_figure(streams: Mapping[str, Stream], style: Style) -> Figure:
+def penalty_figure(streams: Mapping[str, Stream], weights: RewardWeights, style: Style) -> Figure:
     """Success against the weighted sum of time and price (paper, figure 6)."""
+    label, scale = score_label(weights)
     marks: list[Mark] = []
     for name, stream in streams.items():
-        success, penalty = over_seeds(stream.success), over_seeds(stream.penalty)
-        if success is None or penalty is None:
+        score, penalty = over_seeds(stream.score), over_seeds(stream.penalty)
+        if score is None or penalty is None:
             continue
         marks.append(
             Points(
                 name,
                 [penalty.value],
-                [100 * success.value],
+                [scale * score.value],
                 style.colour[name],
                 x_interval=([penalty.low], [penalty.high]),
-                y_interval=([100 * success.low], [100 * success.high]),
+                y_interval=([scale * score.low], [scale * score.high]),
                 size=11,
                 symbol="star" if name in ORACLES.values() else "circle",
                 shown=name in style.shown,
@@ -123,8 +128,8 @@ def penalty_figure(streams: Mapping[str, Stream], style: Style) -> Figure:
     caption = (
         "Means over all decisions with 95% intervals (the paper's figure 6). Up and to the left is better; reward is height minus way to the right."
     )
-    panel = Panel("", "alpha_time · time + alpha_price · cents (reward)", "success (%)", marks)
-    return Figure("success_against_penalty", "Success against time and cost", caption, [panel])
+    panel = Panel("", "alpha_time · time + alpha_price · cents (reward)", label, marks)
+    return Figure("success_against_penalty", f"{label.partition(' (')[0].capitalize()} against time and cost", caption, [panel])
 
 
 def share_figure(streams: Mapping[str, Stream], policies: Sequence[str], style: Style) -> Figure | None:
@@ -144,20 +149,20 @@ def share_figure(streams: Mapping[str, Stream], policies: Sequence[str], style: 
     return Figure("choices", "Who is chosen", caption, panels)
 
 
-def gap_figure(gaps: Mapping[str, tuple[Estimate | None, Estimate | None]], oracle: str) -> Figure | None:
+def gap_figure(gaps: Mapping[str, tuple[Estimate | float | None, Estimate | float | None]], oracle: str) -> Figure | None:
     """Share of the learnable gap closed, over the whole stream and its last quarter.
 
     Args:
         gaps: of each selector, None where it has none.
         oracle: what 100% is.
     """
-    shown = {name: both for name, both in gaps.items() if any(both)}
+    shown = {name: both for name, both in gaps.items() if any(value is not None for value in both)}
     if not shown:
         return None
     marks: list[Mark] = []
     for place, (label, colour) in enumerate((("whole stream", "c0"), ("last quarter", "c3"))):
-        own = {name: both[place] for name, both in shown.items()}
-        found = [(name, estimate) for name, estimate in own.items() if estimate is not None]
+        found = [(name, _with_ends(both[place])) for name, both in shown.items()]
+        found = [(name, estimate) for name, estimate in found if np.isfinite(estimate.value)]
         if not found:
             continue
         values, low, high = ([100 * getattr(estimate, end) for _, estimate in found] for end in ("value", "low", "high"))
@@ -165,6 +170,13 @@ def gap_figure(gaps: Mapping[str, tuple[Estimate | None, Estimate | None]], orac
     caption = f"0% is the best single policy, 100% the {oracle}. With 95% intervals over seeds and over what the expected oracle may be off."
     caption += " A selector that sees more than an oracle by groups can pass it."
     return Figure("gap_closed", "Share of the learnable gap closed", caption, [Panel("", "", "learnable gap closed (%)", marks)])
+
+
+def _with_ends(value: Estimate | float | None) -> Estimate:
+    """Of a number without interval the ends are NaN, which draws none."""
+    if isinstance(value, Estimate):
+        return value
+    return Estimate(np.nan if value is None else value, np.nan, np.nan)
 
 
 def over_seeds(values: Array) -> Estimate | None:

@@ -11,7 +11,7 @@ from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import Row
 from osel_sim.runtime.tables import number, percent
 from osel_sim.selection.reward import RewardWeights, logged_reward, logged_seconds
-from osel_sim.statistics import wilson_interval
+from osel_sim.statistics import effective_trials, wilson_interval
 
 SPLITS: dict[str, Callable[[Row], str | None]] = {
     "task": lambda row: row.task,
@@ -115,8 +115,12 @@ def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
 def _rate(valid: Sequence[Row]) -> str:
     if not valid:
         return "-"
-    successes = sum(row.success for row in valid)
-    return percent(successes / len(valid), wilson_interval(successes, len(valid)))
+    by_instance: dict[str, list[bool]] = defaultdict(list)
+    for row in valid:
+        by_instance[row.instance].append(row.success)
+    rate = sum(row.success for row in valid) / len(valid)
+    trials = effective_trials([float(np.mean(successes)) for successes in by_instance.values()], len(valid))
+    return percent(rate, wilson_interval(min(rate * trials, trials), trials))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
