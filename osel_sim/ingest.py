@@ -6,10 +6,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from osel_sim import cli
 from osel_sim.errors import UsageError
+from osel_sim.ingestion.mapping import VALUES
 
 if TYPE_CHECKING:
     from osel_sim.formats.rollout_log import Row
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
 METRICS = ("table", "action-mse")
 PRESETS = ("mmlu", "waymo", "alfred", "oxe")  # the weights themselves: osel_sim.selection.reward
-VALUES = ("success", "score", "subgoals", "steps", "seconds", "upload", "inference", "download", "motion", "price", "error")
 TABLE_FLAGS = ("text", "image", "group", "key", "policy_column", "repeat_column", "duplicates", "name", *VALUES)
 
 EXAMPLES = """examples:
@@ -149,7 +149,7 @@ def _table(options: argparse.Namespace) -> int:
     inputs = check_out(options.out, instances)
     print(f"{len(records)} rows: {len(instances)} instances, {len(converted.policies)} policies, {len(converted.rows)} outcomes")
     if converted.dropped:
-        print(f"{converted.dropped} duplicate rows left out")
+        print(f"{converted.dropped} duplicate rows left out, {converted.differing or 'none'} of which differed from the row that was kept")
     name = options.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if mapping.images else TFIDF)
     files = sorted({record.file for record in records})
     metadata = {
@@ -186,6 +186,7 @@ def _action_mse(options: argparse.Namespace) -> int:
     instances = [sample.instance for sample in samples]
     inputs = check_out(options.out, instances)
     rows, source = measure(samples, specs, settings)
+    # By `metric`, replay and report know that what counts is the score.
     metadata = {"task": "action-mse", "policies": [spec.name for spec in specs], "source": {"metric": "action-mse", **source}}
     texts = [item.text for item in instances]
     name = options.encoder or f"{DEFAULT_ENCODER}+{TFIDF}"
@@ -194,6 +195,7 @@ def _action_mse(options: argparse.Namespace) -> int:
 
 
 def _mapping(options: argparse.Namespace) -> "Mapping":
+    from osel_sim.ingestion.flags import as_table
     from osel_sim.ingestion.mapping_file import load_mapping, parse_mapping
 
     files = tuple(options.files or ())
@@ -205,53 +207,7 @@ def _mapping(options: argparse.Namespace) -> "Mapping":
     for flag in ("text", "success"):
         if getattr(options, flag) is None:
             raise UsageError(f"--{flag} is missing; python -m osel_sim.ingest --help shows examples")
-    return parse_mapping(_as_table(options, files), Path())
-
-
-def _as_table(options: argparse.Namespace, files: tuple[str, ...]) -> Any:
-    """The flags as what a mapping file would hold."""
-    from osel_sim.formats.validate import Table
-
-    names = options.policies or []
-    for name in names:
-        if names.count(name) > 1:
-            raise UsageError(f"policy {name!r} is named twice after --policies")
-    if not names and options.policy_column is None:
-        raise UsageError("--policies or --policy-column is missing: a wide table needs the policies' names, a long one its column of them")
-    instance = {"text": options.text, "images": options.image, "group": options.group, "key": options.key, "duplicates": options.duplicates}
-    outcome: dict[str, Any] = {"policy": options.policy_column, "repeat": options.repeat_column}
-    policies: dict[str, dict[str, Any]] = {name: {} for name in names}
-    for key in VALUES:
-        for item in getattr(options, key) or []:
-            policy, equals, value = item.partition("=")
-            if equals and policy in policies:
-                policies[policy][key] = _value(key, value, options.at_least)
-            elif equals and names:
-                raise UsageError(f"--{key} {item}: unknown policy {policy!r}: {cli.did_you_mean(policy, names)}known: {', '.join(names)}")
-            elif key in outcome:
-                raise UsageError(f"--{key}: {item!r} is the second value for all policies; write POLICY=VALUE, with the policies after --policies")
-            else:
-                outcome[key] = _value(key, item, options.at_least)
-    data = {
-        "version": 1,
-        "name": options.name or options.out.resolve().name,
-        "table": {"files": list(files)},
-        "instance": {key: value for key, value in instance.items() if value is not None},
-        "outcome": {key: value for key, value in outcome.items() if value is not None},
-        "policies": policies,
-    }
-    return Table(data, "command line")
-
-
-def _value(key: str, text: str, at_least: float | None) -> Any:
-    if key == "success":
-        return text if at_least is None else {"column": text, "at_least": at_least}
-    if key == "error":
-        return text
-    try:
-        return float(text)
-    except ValueError:
-        return text
+    return parse_mapping(as_table(options, files), Path())
 
 
 def _finish(folder: Path, rows: "list[Row]", metric: str, preset_name: str, encoder: str, start: float) -> int:

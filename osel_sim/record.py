@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli, content
 from osel_sim.errors import DataError, OselError, UsageError
-from osel_sim.run import DEFAULT_PRESET, NOISE_HELP, SPLITS
+from osel_sim.reward_flags import DEFAULT_PRESET
+from osel_sim.run import NOISE_HELP, SPLITS
 
 if TYPE_CHECKING:
     from osel_sim.runtime.recording import Recording

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli
 from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.reward_flags import add_reward_flags, weights_of
 
 if TYPE_CHECKING:
     from osel_sim.offline.engine import Setup
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from osel_sim.selection.reward import RewardWeights
 
 COSTS, SKILLS = "expected_costs", "skills"
-"""Settings of selectors that take what policies cost, and what they were made for, from what is declared of them, rather than learn it."""
+"""Settings of selectors that are told what policies cost, and what they were made for, rather than learn it."""
 
 EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/pick_place                                   # every selector there is, 20 seeds
@@ -28,6 +29,7 @@ EXAMPLES = """examples:
 Shows the log's instances in random orders without replacement to every selector, which sees only the outcome of its choice, and says how far each
 stays from the oracles and whether routing is worth it. Fixed policies, the best and the worst of them, and the oracles are always included.
 Instances on which some policy has no valid outcome are left out and counted. The result does not depend on --workers.
+A log has no price lists: what policies cost, auto is told from the other half where --half is given, else from the log itself.
 With --half a selector that learns off-policy can be shown all outcomes of the other half before its stream begins: auto:warm, linucb:warm ...
 
 Once that is said and written, selectors are replayed at other weights of time and price too, for the frontier: about as long again.
@@ -48,10 +50,11 @@ def main(arguments: list[str] | None = None) -> int:
     folder: Path = options.out or Path("runs") / f"replay-{options.log.resolve().name}"
     check_folder(folder, options.overwrite)
     if not is_live_run(options.log):
-        _replay(options, folder, selectors, read_log(options.log, options.encoder), *_weights(options))
+        log = read_log(options.log, options.encoder)
+        _replay(options, folder, selectors, log, *weights_of(options, log.metadata))
     else:
         live = read_live(options.log, options.encoder)
-        weights, preset = _weights(options, live.reward)
+        weights, preset = weights_of(options, recorded=live.reward)
         found = _off_policy(options, live, weights)
         if live.has_all_outcomes(weights):
             _replay(options, folder, selectors, live.outcomes, weights, preset, found)
@@ -71,12 +74,8 @@ def parser() -> cli.Parser:
     add("--seeds", type=cli.positive_int, default=20, metavar="N", help="number of random orders (default: %(default)s)")
     add("--decisions", type=cli.positive_int, metavar="N", help="length of a stream (default: all instances)")
     add("--half", choices=("choose", "score"), help="only this half of the instances: one to choose settings by, the other to report (default: all)")
-    add("--preset", metavar="NAME", help="reward weights of the paper: mmlu, waymo, alfred, oxe (default: oxe)")
-    add("--alpha-time", type=cli.non_negative_float, metavar="A", help="weight of time in the reward (default: the preset's)")
-    add("--alpha-price", type=cli.non_negative_float, metavar="A", help="weight of the price in cents (default: the preset's)")
-    add("--time-unit", choices=("log10-seconds", "steps"), help="of time in the reward (default: the preset's)")
-    add("--success", choices=("success", "subgoals", "score"), help="what counts as success in the reward (default: the preset's)")
-    add("--unknown-costs", action="store_true", help="let all selectors learn what policies cost (default: auto is told, as it is declared)")
+    add_reward_flags(result)
+    add("--unknown-costs", action="store_true", help="let all selectors learn what policies cost (default: auto is told their mean cost)")
     add("--unknown-skills", action="store_true", help="do not tell auto what policies were made for (default: it is told what the log says of it)")
     add("--no-frontier", action="store_true", help="do not replay selectors at other weights of time and price as well")
     add("--encoder", metavar="NAME", help="whose contexts, where the log has several (default: the one it was recorded with)")
@@ -107,12 +106,16 @@ def _replay(
     from osel_sim.offline.streams import complete_instances
     from osel_sim.offline.tables import print_replay
     from osel_sim.runtime.tables import console
+    from osel_sim.selection.skills import Skills
 
     if options.policies:
         log = log.only(options.policies)
     others = log
     if options.half:
-        log, others = log.take(log.half(options.half)), log.take(~log.half(options.half))
+        mine = log.half(options.half)
+        if not mine.any():
+            raise UsageError(f"--half {options.half}: none of the {len(log)} instances of {log.source} is in that half; leave the flag out")
+        log, others = log.take(mine), log.take(~mine)
     log, left_out = complete_instances(log, weights)
     if left_out.instances:
         print(f"warning: {left_out.instances} instances without an outcome of every policy are left out", file=sys.stderr)
@@ -123,6 +126,7 @@ def _replay(
             file=sys.stderr,
         )
     setup = _setups(log, others, selectors, options)
+    told = setup(weights).settings.values()
     best = oracles(log, weights)
     decisions = len(log) if options.decisions is None else options.decisions
     with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
@@ -131,8 +135,9 @@ def _replay(
     result = build(log, weights, preset, choices, best, left_out, range(options.seeds))
     result["log"]["half"] = options.half
     result["off_policy"] = off_policy
-    result["expected_costs"] = None if options.unknown_costs else others.expected_costs(weights)
-    result["skills"] = None if log.skills is None or options.unknown_skills else {policy: list(names) for policy, names in log.skills.able.items()}
+    result["expected_costs"] = next((dict(settings[COSTS]) for settings in told if COSTS in settings), None)
+    skills: Skills | None = next((settings[SKILLS] for settings in told if SKILLS in settings), None)
+    result["skills"] = None if skills is None else {policy: list(names) for policy, names in skills.able.items()}
     write_replay(folder, result, choices, tables(result))
     print_replay(console(), result)
     learners = [name for name in selectors if name != "random"]
@@ -187,8 +192,7 @@ def _setups(
     from osel_sim.selection.registry import wanted_of
 
     def setup(weights: "RewardWeights") -> Setup:
-        costs = None if options.unknown_costs else others.expected_costs(weights)
-        known: dict[str, Any] = {COSTS: costs} if costs is not None and set(costs) == set(log.policies) else {}
+        known: dict[str, Any] = {} if options.unknown_costs else {COSTS: others.expected_costs(weights)}
         if log.skills is not None and not options.unknown_skills:
             known[SKILLS] = log.skills
         beforehand = Beforehand(others.contexts, others.rewards(weights)) if options.half else None
@@ -230,23 +234,6 @@ def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[
                 raise UsageError(f"selector {name!r} is shown the outcomes of the log's other half beforehand: say which half to replay with --half")
             check_can_start_warm(kind)
     return [name for name in dict.fromkeys(names) if name.partition(":")[0] != "fixed" and name not in REFERENCES]
-
-
-def _weights(options: argparse.Namespace, recorded: "dict[str, Any] | None" = None) -> "tuple[RewardWeights, str | None]":
-    """Weights of the reward, and the preset's name where they are a preset's.
-
-    Args:
-        recorded: of a live run, which count where no preset is named.
-    """
-    from dataclasses import replace
-
-    from osel_sim.run import DEFAULT_PRESET
-    from osel_sim.selection.reward import PRESETS, RewardWeights, preset
-
-    base = RewardWeights(**recorded) if recorded and options.preset is None else preset(options.preset or DEFAULT_PRESET)
-    given = {key: getattr(options, key) for key in ("alpha_time", "alpha_price", "time_unit", "success")}
-    weights = replace(base, **{key: value for key, value in given.items() if value is not None})
-    return weights, next((name for name, known in PRESETS.items() if known == weights), None)
 
 
 if __name__ == "__main__":

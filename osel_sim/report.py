@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING
 
 from osel_sim import cli
 from osel_sim.errors import DataError, UsageError
+from osel_sim.reward_flags import FLAGS, add_reward_flags, weights_of
 
 if TYPE_CHECKING:
     from osel_sim.offline.log import LoggedOutcomes
     from osel_sim.reporting.page import Page
-
-DEFAULT_PRESET = "oxe"
 
 EXAMPLES = """examples:
   python -m osel_sim.report runs/first --open              # a live run (osel_sim.run)
@@ -47,9 +46,8 @@ def parser() -> cli.Parser:
     add("--log", type=cli.folder, metavar="DIR", help="of a replay: its rollout log, where that is no longer where it was")
     add("--scenes", type=cli.non_negative_int, default=0, metavar="N", help="render how N instances begin, again from their seeds (default: none)")
     add("--tasks", type=cli.folder, metavar="DIR", help="with --scenes: folder with task files of your own")
-    add("--preset", metavar="NAME", help=f"of a rollout log: reward weights of the paper: mmlu, waymo, alfred, oxe (default: {DEFAULT_PRESET})")
-    add("--alpha-time", type=cli.non_negative_float, metavar="A", help="of a rollout log: weight of time in the reward (default: the preset's)")
-    add("--alpha-price", type=cli.non_negative_float, metavar="A", help="of a rollout log: weight of the price in cents (default: the preset's)")
+    add("--encoder", metavar="NAME", help="of a rollout log: whose contexts, where it has several (default: the one it was recorded with)")
+    add_reward_flags(result, "of a rollout log: ")
     return result
 
 
@@ -65,19 +63,16 @@ def _page(options: argparse.Namespace) -> "Page":
 
         return render_scenes(log, options.scenes, options.tasks) if options.scenes else {}
 
-    weights = {"--preset": options.preset, "--alpha-time": options.alpha_time, "--alpha-price": options.alpha_price}
     if (folder / ROLLOUTS).is_file():
-        from dataclasses import replace
-
+        from osel_sim.offline.log import read_log
         from osel_sim.reporting.log_page import log_page
-        from osel_sim.selection.reward import preset
 
-        given = {"alpha_time": options.alpha_time, "alpha_price": options.alpha_price}
-        given = {name: value for name, value in given.items() if value is not None}
-        return log_page(folder, replace(preset(options.preset or DEFAULT_PRESET), **given), draw)
-    for flag, value in weights.items():
-        if value is not None:
-            raise UsageError(f"{flag}: {folder} is no rollout log; a run and a replay have the weights they were made with")
+        log = read_log(folder, options.encoder)
+        weights, _ = weights_of(options, log.metadata)
+        return log_page(log, weights, draw)
+    for flag in ("encoder", *FLAGS):
+        if getattr(options, flag) is not None:
+            raise UsageError(f"--{flag.replace('_', '-')}: {folder} is no rollout log; a run and a replay have what they were made with")
     if (folder / REPLAY).is_file():
         from osel_sim.reporting.replay_page import ReplayOptions, replay_page
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli, content
 from osel_sim.errors import OselError, UnknownNameError
+from osel_sim.reward_flags import DEFAULT_PRESET
 
 if TYPE_CHECKING:
     from osel_sim.context.encoder import Encoder
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from osel_sim.runtime.tensorboard import TensorBoard
     from osel_sim.selection.reward import RewardWeights
 
-DEFAULT_PRESET = "oxe"
 SPLITS = ("train", "validation", "test")
 NOISE_HELP = "standard deviation of noise on the motions of every action, in units of action; 1 is 5 cm or half a radian (default: %(default)s)"
 

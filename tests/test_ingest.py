@@ -243,14 +243,15 @@ WIDE = ["--text", "q", "--policies", "a", "--success", "a"]
     [
         ("", WIDE, "t.csv: is empty, expected a header"),
         ("q,a\n", WIDE, "t.csv: has no rows"),
-        ("q,aa\nx,1\n", WIDE, "there is no column 'a', which command line names as outcome of policy 'a': did you mean 'aa'? columns: q, aa"),
+        ("q,aa\nx,1\n", WIDE, "there is no column 'a', which --success of policy 'a' names: did you mean 'aa'? columns: q, aa"),
         ("q,a,a\nx,1,1\n", WIDE, "line 1: column 'a' is there twice"),
         ("q,a\nx,1\ny\n", WIDE, "row 2 (line 3): has 1 fields, the header has 2; the file was cut, or a quote is missing"),
-        ('q,a\nx,1\n"y', WIDE, "the row that begins at line 3 cannot be read (unexpected end of data); the file was cut or a quote is wrong"),
+        ('q,a\nx,1\n"y', WIDE, "the row that begins at line 3 cannot be read (unexpected end of data); the file was cut, a quote is wrong"),
         ("q,a\nx,1\nx,0\n", WIDE, "row 2 (line 3): instance 'log/000001' is in row 1 of"),
         ("q,a\nx,1\ny,nan\n", WIDE, "row 2 (line 3), column 'a': is NaN; leave it empty where the policy did not run"),
         ("q,a\nx,1\ny,0.5\n", WIDE, "column 'a': must be true or false (or 1 or 0), got '0.5'; a graded outcome is a score"),
-        ("q,a\nx,1\ny,maybe\n", WIDE, "column 'a': must be true or false (or 1 or 0), got 'maybe'"),
+        ("q,a\nx,1\ny,maybe\n", WIDE, "must be true or false (or 1 or 0), got 'maybe'; a mapping file (--map) says which words mean it: success = {"),
+        ("q,a\nx,1\ny,2\n", WIDE, "got '2'; a graded outcome is a score, and its success a threshold: --success COLUMN --at-least X; leave it empty"),
         ("q,a\nx,\n", WIDE, "policy 'a' has no outcome in any row"),
         ("q,a\n,1\n", WIDE, "row 1 (line 2), column 'q': is empty, expected text"),
         ("q,a,p\nx,1,2\ny,0,much\n", [*WIDE, "--price", "p"], "row 2 (line 3), column 'p': must be a number, got 'much'"),
@@ -264,6 +265,21 @@ WIDE = ["--text", "q", "--policies", "a", "--success", "a"]
         ("q,m,s,r\nx,a,1,first\n", [*LONG, "--repeat-column", "r"], "column 'r': must be a number, got 'first'"),
         ("q,m,s,k\nx,a,1,7\ny,b,1,7\n", [*LONG, "--key", "k"], "row 2 (line 3): instance 'log/7' has another text or image here than in row 1"),
         (b"q,a\n\xff\xfe,1\n", WIDE, "t.csv: is not UTF-8 text"),
+        ("q,a,p\nx,1,1_000\n", [*WIDE, "--price", "p"], "column 'p': must be a number, got '1_000'"),
+        ("q,a,p\nx,1,'1,000'\n".replace("'", '"'), [*WIDE, "--price", "p"], "column 'p': must be a number, got '1,000'"),
+        ("q,a\nx,1\n", [*WIDE, "--price", "1_000"], "there is no column '1_000', which --price of policy 'a' names"),
+        ("q,a\nx,1\n", [*WIDE, "--seconds", "-1"], "policy 'a': seconds must lie in [0, inf], got -1"),
+        ("q,a,p\nx,1,-1\n", [*WIDE, "--seconds", "p"], "column 'p': seconds must lie in [0, inf], got -1"),
+        ("q,a\nx,1\nx,0\n", WIDE, "--duplicates drop or repeats"),
+        ("q;a\nx;1\n", WIDE, "columns: q;a; it seems to be separated by ';', but a .csv is by ',' and a .tsv by '\\t': write it with one of these"),
+        ("q\ta\nx\t1\n", WIDE, "it seems to be separated by '\\t', but a .csv is by ',' and a .tsv by '\\t': name it .tsv"),
+        ("q;a\nx;0,5\n", WIDE, "has 2 fields, the header has 1; the file was cut, or a quote is missing; it seems to be separated by ';'"),
+        ("q,m,s\nx,large,1\nx,large ,1\n", LONG, "row 2 (line 3), column 'm': policy 'large ' and 'large' differ only in capitals or spaces"),
+        (
+            "q,m,s\nx,large,1\nx,Large,1\n",
+            LONG,
+            "policy 'Large' and 'large' differ only in capitals or spaces; write both alike, or name",
+        ),
     ],
 )
 def test_a_bad_table_gets_one_line(content, flags, says, tmp_path, capsys):
@@ -271,6 +287,70 @@ def test_a_bad_table_gets_one_line(content, flags, says, tmp_path, capsys):
     file.write_bytes(content if isinstance(content, bytes) else content.encode())
     line = refused(capsys, tmp_path / "log", "--files", file, *flags)
     assert says in line and "t.csv" in line
+
+
+TWO = ["--text", "q", "--policies", "a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (
+            [*TWO, "--success", "a"],
+            "--success: is 'a' for each of a, b; let {policy} in it stand for the policy's name, or",
+        ),
+        ([*TWO, "--success", "a", "--at-least", "1"], "--success: is {'column': 'a', 'at_least': 1.0} for each of a, b"),
+        ([*TWO, "--success", "{policy}", "--score", "p"], "--score: is 'p' for each of a, b"),
+        ([*TWO, "--success", "a=a", "b=b", "--price", "a=1"], "--price of policy 'b': is missing, policy 'a' has it"),
+        ([*TWO, "--success", "{policy}", "--seconds", "a=1"], "--seconds of policy 'b': is missing, policy 'a' has it"),
+        ([*TWO, "--success", "a=a"], "--success of policy 'b': is missing; --success COLUMN --at-least X takes a score"),
+        ([*TWO, "--success", "{policy}", "--price", "1e99"], "--price of policy 'a': must lie in"),
+        ([*TWO, "--success", "{policy}", "--at-least", "1e99"], "--at-least: must lie in"),
+        ([*TWO, "--success", "{policy}", "--group", "g"], "there is no column 'g', which --group names: columns: q, a, b, p"),
+        (["--text", "q", "--policy-column", "m", "--success", "a"], "there is no column 'm', which --policy-column names"),
+        (["--text", "q", "--policy-column", "q", "--success", "s"], "there is no column 's', which --success names"),
+        (["--text", "q", "--policy-column", "q", "--success", "a", "--duplicates", "keep"], "--duplicates: must be"),
+        ([*TWO, "--success", "{policy}", "--text", "is {q"], "--text: 'is {q' has a brace too many or too few; {COLUMN} stands for a column's text"),
+        ([*TWO, "--success", "{policy}", "--text", "{{q}}"], "--text: '{{q}}' has a brace too many or too few"),
+    ],
+)
+def test_wrong_flags_are_named(flags, says, tmp_path, capsys):
+    (tmp_path / "t.csv").write_text("q,a,b,p\nx,1,0,1\n")
+    assert says in refused(capsys, tmp_path / "log", "--files", tmp_path / "t.csv", *flags)
+
+
+def test_policies_may_share_what_they_are_given_each(tmp_path):
+    (tmp_path / "t.csv").write_text("q,a,p\nx,1,2\ny,0,3\n")
+    flags = [*TWO, "--success", "a=a", "b=a", "--price", "p", "--subgoals", "1"]  # the same model at two prices, or the same price
+    assert run("--files", tmp_path / "t.csv", *flags, "--out", tmp_path / "log") == 0
+    rows = read_rollouts(tmp_path / "log")[0]
+    assert [(row.policy, row.success, row.price) for row in rows] == [("a", True, 2), ("b", True, 2), ("a", False, 3), ("b", False, 3)]
+
+
+def test_policies_that_look_alike_may_be_named(tmp_path):
+    (tmp_path / "t.csv").write_text("q,m,s\nwhere is it,large,1\nwhere is it,Large,0\n")
+    assert run("--files", tmp_path / "t.csv", *LONG, "--policies", "large", "Large", "--out", tmp_path / "log") == 0
+    assert [(row.policy, row.success) for row in read_rollouts(tmp_path / "log")[0]] == [("large", True), ("Large", False)]
+
+
+def test_bytes_are_text(tmp_path, capsys):
+    columns = {"q": [b"wo?", "wer \u00e4h?".encode()], "a": [b"true", b"0"], "p": [b"1", b"2"], "image": [b"\x89PNG", b"\xff"]}
+    pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "t.parquet")
+    assert run("--files", tmp_path / "t.parquet", *WIDE, "--price", "p", "--out", tmp_path / "log") == 0
+    rows = read_rollouts(tmp_path / "log")[0]
+    assert [(row.instruction, row.success, row.price) for row in rows] == [("wo?", True, 1.0), ("wer \u00e4h?", False, 2.0)]
+    capsys.readouterr()
+    line = refused(capsys, tmp_path / "other", "--files", tmp_path / "t.parquet", *WIDE, "--group", "image")
+    assert "row 1, column 'image': must be text, got 4 bytes that are not UTF-8" in line
+
+
+def test_unknown_rewards_are_dashes(tmp_path, capsys):
+    (tmp_path / "t.csv").write_text("q,a,b\nwhere is it,1,0\n")
+    assert run("--files", tmp_path / "t.csv", *TWO, "--success", "{policy}", "--out", tmp_path / "log") == 0
+    text = capsys.readouterr().out
+    assert "best on" in text
+    line = next(line for line in text.splitlines() if line.startswith("│ a "))
+    assert [cell.strip() for cell in line.strip("│").split("│")][-4:] == ["-", "-", "0", "0"]  # reward, best on, fallbacks, errors
 
 
 def test_bad_files_of_other_kinds(tmp_path, capsys):
@@ -288,6 +368,24 @@ def test_bad_files_of_other_kinds(tmp_path, capsys):
     (tmp_path / "f.xlsx").write_text("")
     assert "unknown format '.xlsx', known: .csv" in refused(capsys, out, "--files", tmp_path / "f.xlsx", *WIDE)
     assert "there is no such file" in refused(capsys, out, "--files", tmp_path / "g.csv", *WIDE)
+    (tmp_path / "i.jsonl").write_text('{"q": "x", "a": true}\n{"q": "y", "a": true, "a": false}\n')
+    assert "i.jsonl, line 2: key 'a' is there twice" in refused(capsys, out, "--files", tmp_path / "i.jsonl", *WIDE)
+    (tmp_path / "j.jsonl").write_text('{"q": "a \\ud800 b", "a": true}\n')
+    line = refused(capsys, out, "--files", tmp_path / "j.jsonl", *WIDE)
+    assert "j.jsonl, row 1 (line 1), column 'q': must be text, got '\\ud800' in it, which is only half of a character" in line
+    (tmp_path / "k.jsonl").write_text('{"q": "x", "a": ' + "[" * 100_000 + "\n")
+    assert "k.jsonl, line 1: is not JSON" in refused(capsys, out, "--files", tmp_path / "k.jsonl", *WIDE)
+    twice = pyarrow.table([["x"], [True], [False]], names=["q", "a", "a"])
+    pyarrow.parquet.write_table(twice, tmp_path / "l.parquet")
+    assert "l.parquet: column 'a' is there twice" in refused(capsys, out, "--files", tmp_path / "l.parquet", *WIDE)
+    (tmp_path / "m.csv").write_text('"q";"a"\n"x";1\n')
+    assert "a quote is wrong, or it is not separated by ','" in refused(capsys, out, "--files", tmp_path / "m.csv", *WIDE)
+    (tmp_path / "n.tsv").write_text("q,a\nx,1\n")
+    assert "it seems to be separated by ',', but a .csv is by ',' and a .tsv by '\\t': name it .csv" in refused(
+        capsys, out, "--files", tmp_path / "n.tsv", *WIDE
+    )
+    (tmp_path / "sun_o.csv").write_text("q;a\nx;1\n")
+    assert "it seems to be separated by ';'" in refused(capsys, out, "--files", tmp_path / "{topic}_o.csv", *WIDE, "--group", "topic")
     (tmp_path / "h1.csv").write_text("q,a\nx,1\n")
     (tmp_path / "h2.csv").write_text("q,b\nx,1\n")
     assert "h2.csv: column" in refused(capsys, out, "--files", tmp_path / "h*.csv", *WIDE)
@@ -309,7 +407,7 @@ policies.a = {}
         ('["q.csv"]', "id,q\n1,x\n1,y\n2,z\n", "row 2 (line 3), column 'id': '1' is in row 1 of"),
         ('["q.csv"]', "id,q\n1,x\n,y\n", "q.csv, row 2 (line 3), column 'id': is empty, expected text"),
         ('["q.csv"]', "id,q,a\n1,x,1\n2,y,1\n", "column 'a' is in"),
-        ('["q.csv"]', "key,q\n1,x\n", "there is no column 'id' to join on; columns: key, q"),
+        ('["q.csv"]', "key,q\n1,x\n", "there is no column 'id' to join on: columns: key, q"),
     ):
         (tmp_path / "q.csv").write_text(content)
         (tmp_path / "m.toml").write_text(mapping.replace("FILES", files))
@@ -332,6 +430,14 @@ policies.a = {}
         ('count = "characters"', 'count = "letters"', "unknown value 'letters'"),
         ("seconds = 0.25", "seconds = 0.25\ninference = 0.25", "seconds: is the total, where its parts are not known; inference is given as well"),
         ('name = "quiz"', 'name = "quiz', "quiz.toml: TOML"),
+        ('text = "prompt"', 'text = "Q: {prompt"', "instance.text: 'Q: {prompt' has a brace too many or too few"),
+        ('"{policy}"', '"small"', "outcome.success: is 'small' for each of small, big/model-1; let {policy} in it stand for the policy's name"),
+        ('"{policy}"', '"{policy}"\nscore = ["prompt", 1]', "outcome.score: is ['prompt', 1] for each of small, big/model-1"),
+        (
+            'text = "prompt"',
+            'text = "promt"',
+            "quiz.toml names as instance.text: did you mean 'prompt'? columns: prompt, small",
+        ),
     ],
 )
 def test_a_bad_mapping_file_gets_one_line(old, new, says, tmp_path, capsys):
@@ -366,6 +472,26 @@ def test_duplicates_as_told(tmp_path):
     for how, rows in expected.items():
         assert run("--files", tmp_path / "t.csv", *WIDE, "--name", "log", "--duplicates", how, "--out", tmp_path / how) == 0
         assert [(row.instance, row.repeat, row.success) for row in read_rollouts(tmp_path / how)[0]] == rows
+
+
+@pytest.mark.parametrize(
+    ("content", "flags", "says"),
+    [
+        ("what is x,1\nwhat is x,0\nwhat is x,1\n", WIDE, "2 duplicate rows left out, 1 of which differed from the row that was kept"),
+        ("what is x,1\nwhat is x,1\nwhat is x,\n", WIDE, "2 duplicate rows left out, 1 of which differed from the row that was kept"),
+        ("what is x,1\nwhat is x,1\n", WIDE, "1 duplicate rows left out, none of which differed from the row that was kept"),
+        (
+            "what is x,1,a\nwhat is x,0,a\nwhat is x,1,b\nwhat is x,1,b\n",
+            LONG,
+            "2 duplicate rows left out, 1 of which differed from the row that was kept",
+        ),
+    ],
+)
+def test_dropped_rows_that_differ_are_counted(content, flags, says, tmp_path, capsys):
+    (tmp_path / "t.csv").write_text(("q,a\n" if flags is WIDE else "q,s,m\n") + content)
+    assert run("--files", tmp_path / "t.csv", *flags, "--duplicates", "drop", "--out", tmp_path / "log") == 0
+    assert says in capsys.readouterr().out
+    assert all(row.success for row in read_rollouts(tmp_path / "log")[0])
 
 
 def test_a_folder_in_use_is_left_alone_and_the_same_log_goes_on(tmp_path, capsys):

@@ -1,5 +1,7 @@
 """Analysis of a rollout log, on logs whose answers are known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from report_helpers import FAR, NEAR, WEIGHTS, made_log
@@ -8,10 +10,11 @@ from synthetic_log import make_row, write_log
 from osel_sim.errors import DataError
 from osel_sim.offline.clusters import describe, find_clusters, inequality
 from osel_sim.offline.contexts import best_policies, lay_out, wording
+from osel_sim.offline.estimate import rate_of
 from osel_sim.offline.frontier import frontiers
 from osel_sim.offline.log import read_log
 from osel_sim.offline.outcomes import outcome_rates, per_group, remote_policies
-from osel_sim.offline.weights_map import trivial_ranges, weights_map
+from osel_sim.offline.weights_map import swept, trivial_ranges, weights_map
 from osel_sim.selection.reward import RewardWeights
 
 REMOTE = np.array([False, True])
@@ -55,6 +58,24 @@ def test_what_did_not_run_is_no_failure(tmp_path):
     assert best_policies(log, FREE) == ("unknown", "unknown")
     with pytest.raises(DataError, match="no instance has an outcome of every policy"):
         inequality(log, np.zeros(2, np.int64), FREE, np.array([False, True]))
+
+
+def test_repeats_with_other_numbers_are_paired_too(tmp_path):
+    rows = [make_row("i0", "a", 0), make_row("i0", "b", 1, success=False, upload=0.1), make_row("i0", "b", 0, upload=0.1, error="died")]
+    log = read_log(write_log(tmp_path, rows, {"i0": np.ones(3)}))
+    (rates,) = outcome_rates(log, REMOTE)
+    assert (rates.pairs, rates.only_local.value) == (1, 1.0)
+
+
+def test_a_rate_of_nothing_or_all_is_not_certain_with_repeats():
+    once, thrice = np.zeros((50, 1)), np.zeros((50, 3))
+    thrice[10:, 1:] = np.nan
+    assert rate_of(once).high == rate_of(thrice).high == pytest.approx(0.071, abs=0.001)
+    generator = np.random.default_rng(0)
+    alike = np.repeat(generator.random((400, 1)) < 0.4, 3, axis=1).astype(float)  # repeats that tell nothing new
+    fresh = (generator.random((400, 3)) < 0.4).astype(float)  # repeats as good as other instances
+    width = {name: rate_of(values).high - rate_of(values).low for name, values in (("alike", alike), ("once", alike[:, :1]), ("fresh", fresh))}
+    assert width["alike"] == pytest.approx(width["once"]) and width["fresh"] == pytest.approx(width["once"] / np.sqrt(3), rel=0.1)
 
 
 def test_remote_policies_are_told_by_network_then_price_then_success(tmp_path):
@@ -136,13 +157,48 @@ def test_trivial_ranges_and_map(tmp_path):
     assert found.remote_share[high, 0] == 0.0 and found.gain[high, 0] == pytest.approx(0.0)
 
 
+def test_several_remote_policies_leave_something_to_route(tmp_path):
+    """All clusters want a remote policy, but not the same one; by the paper's formula, too, all go remote while it costs little."""
+    rows, contexts = [], {}
+    for number in range(40):
+        contexts[f"i{number}"] = np.array([5.0 * (number < 20), 0.01 * number])
+        rows.append(make_row(f"i{number}", "local", success=False))
+        rows.append(make_row(f"i{number}", "near", success=number < 20, upload=0.1, price=1.0))
+        rows.append(make_row(f"i{number}", "far", success=number >= 20, upload=0.1, price=2.0))
+    log = read_log(write_log(tmp_path, rows, contexts))
+    _, price = trivial_ranges(log, np.repeat([0, 1], 20), FREE, np.array([False, True, True]))
+    assert price.all_remote_below == pytest.approx(0.5, rel=0.05) and price.all_local_above == pytest.approx(1.0, rel=0.05)
+    assert [policy for policy, _, _ in price.one_policy] == ["local"] and price.one_policy[0][1] == pytest.approx(1.0, rel=0.05)
+    # The paper's local side is 1 - p_FS = 0 on both.
+    assert price.paper_all_remote_below == pytest.approx(0.5, rel=0.05)
+
+
+def test_what_is_not_known_is_not_free(tmp_path):
+    """The remote policy's times and prices are known on the second half of the instances only: weights are moved on those alone, or not at all."""
+    unknown = {"upload": None, "inference": None, "download": None, "motion": None, "price": None}
+    rows, contexts = [], {f"i{number}": np.array([5.0 * (number % 2), 0.01 * number]) for number in range(40)}
+    for number in range(40):
+        rows.append(make_row(f"i{number}", "local", success=number % 4 == 0))
+        rows.append(make_row(f"i{number}", "remote", success=number >= 20, **({"price": 10.0, "motion": 4.0} if number >= 20 else unknown)))
+    log, labels = read_log(write_log(tmp_path / "partly", rows, contexts)), np.arange(40) % 2
+    part = swept(log, FREE)
+    assert part.axes == ("alpha_time", "alpha_price") and part.rows.tolist() == [False] * 20 + [True] * 20
+    found = weights_map(log, labels, FREE, REMOTE)
+    assert found is not None and np.isfinite(found.gain).all() and found.remote_share[-1, -1] == 0.0
+    (hindsight, _), (_, price) = (frontiers(log, labels, FREE, axis, 1.0) for axis in ("alpha_price", "alpha_time"))
+    assert hindsight.means["score"][0] == 1.0 and np.isfinite(price.means["price"]).all()
+    rows = [replace(row, **unknown) if row.policy == "remote" else row for row in rows]
+    none = read_log(write_log(tmp_path / "none", rows, contexts))
+    assert swept(none, FREE).axes == () and trivial_ranges(none, labels, FREE, REMOTE) == [] and weights_map(none, labels, FREE, REMOTE) is None
+
+
 def test_frontier_runs_from_all_success_to_no_price(tmp_path):
     log = two_clusters(tmp_path)
     hindsight, by_cluster = frontiers(log, np.repeat([0, 1], 20), FREE, "alpha_price", 0.3)
     for frontier in (hindsight, by_cluster):
-        assert (frontier.score[0], frontier.price[0]) == (1.0, 5.0)
-        assert (frontier.score[-1], frontier.price[-1]) == (0.5, 0.0)
-        assert (np.diff(frontier.price) <= 1e-9).all()
+        assert (frontier.means["score"][0], frontier.means["price"][0]) == (1.0, 5.0)
+        assert (frontier.means["score"][-1], frontier.means["price"][-1]) == (0.5, 0.0)
+        assert (np.diff(frontier.means["price"]) <= 1e-9).all()
 
 
 def test_contexts_are_laid_out_with_their_labels(log, tmp_path):

@@ -14,6 +14,7 @@ from osel_sim.formats.journal import Decision, to_line
 from osel_sim.formats.outcome import Outcome, Seconds
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.formats.run_config import read_json
+from osel_sim.offline.evaluation import evaluate
 from osel_sim.offline.live import is_live_run, read_live
 from osel_sim.selection.reward import RewardWeights
 
@@ -80,6 +81,23 @@ def test_estimates_from_the_propensities(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "--counterfactual" in printed and "1 decisions that ended in error" in printed
     assert replay.main([str(run), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_errors_of_one_policy_do_not_favour_the_other(tmp_path):
+    """Every episode that ends well is worth the same, and half of the remote policy's do not: no policy is worth more than that."""
+    folder = make_run(tmp_path / "run", decisions=400)
+    lines = []
+    for line in (folder / "episodes.jsonl").read_text().splitlines():
+        decision = json.loads(line)
+        if "policy" in decision:  # one in five is remote, as its propensity says, and one in ten ends in error
+            decision |= {"policy": "local" if decision["index"] % 5 else "remote", "error": None, "success": True, "reward": 1.0}
+            decision |= {"error": "the server died", "reward": None} if decision["index"] % 10 == 0 else {}
+        lines.append(json.dumps(decision))
+    (folder / "episodes.jsonl").write_text("\n".join(lines) + "\n")
+    found = evaluate(read_live(folder), FREE)
+    assert found["run"]["errors"] == 40
+    for target in ("fixed:local", "fixed:remote", "random"):
+        assert found["targets"][target]["ips"] == pytest.approx(1.0) == found["targets"][target]["snips"], target
 
 
 def test_with_all_outcomes_it_is_a_log(tmp_path):

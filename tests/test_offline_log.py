@@ -44,11 +44,11 @@ def test_errors_and_what_never_ran_are_missing_not_failures(tmp_path: Path):
     assert log.contexts[1].tolist() == [2, 2, 2]
 
 
-def test_expected_costs_are_those_of_successes(tmp_path: Path):
+def test_expected_costs_are_those_of_successes_where_there_are_any(tmp_path: Path):
     rows = [make_row(f"i{n}", policy, motion=10.0 ** (n + 1), price=n, success=n < 2) for n in range(3) for policy in "ab"]
-    rows += [make_row("i0", "never", success=False)]
+    rows += [make_row("i0", "never", success=False, motion=100.0, price=3.0)]
     log = read_log(write_log(tmp_path, rows, {f"i{n}": ONE for n in range(3)}))
-    assert log.expected_costs(RewardWeights(0.5, 0.1)) == pytest.approx({"a": 0.8, "b": 0.8})
+    assert log.expected_costs(RewardWeights(0.5, 0.1)) == pytest.approx({"a": 0.8, "b": 0.8, "never": 1.3})
 
 
 def test_halves_are_disjoint_complete_and_do_not_depend_on_the_rest(tmp_path: Path):

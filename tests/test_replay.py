@@ -14,14 +14,16 @@ import numpy as np
 import pytest
 from synthetic_log import clusters, make_row, write_log
 
-from osel_sim import replay
+from osel_sim import replay, report
 from osel_sim.errors import DataError
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.formats.rollout_log import write_rollouts
 from osel_sim.offline.engine import Setup
 from osel_sim.offline.engine import replay as replay_all
 from osel_sim.offline.log import read_log
+from osel_sim.offline.measures import Curves, gap_closed
 from osel_sim.selection.reward import RewardWeights
+from osel_sim.statistics import RESAMPLES
 
 FREE = ["--alpha-time", "0", "--alpha-price", "0", "--workers", "1", "--no-frontier"]
 
@@ -145,6 +147,64 @@ def test_the_frontier_follows_the_price(tmp_path: Path, capsys):
     assert run(folder, "--out", tmp_path / "without", *flags, "--no-frontier") == 0
     again, _ = read_replay(tmp_path / "without")
     assert again == without, "what is measured at the weights given does not depend on it"
+
+
+def test_one_seed_has_intervals_over_its_decisions_and_auto_is_told_every_cost(tmp_path: Path):
+    generator = np.random.default_rng(0)
+    contexts = {f"i{number}": generator.normal(size=8) for number in range(60)}
+    costs = {"free": 0.0, "paid": 5.0, "hopeless": 1.0}
+    rows = [
+        make_row(key, name, success=name != "hopeless" and bool(generator.random() < 0.5), price=price)
+        for key in contexts
+        for name, price in costs.items()
+    ]
+    folder = write_log(tmp_path / "log", rows, contexts)
+    flags = ["--selectors", "auto", "random", "--seeds", 1, "--alpha-time", 0, "--alpha-price", 0.01, "--workers", 1, "--no-frontier"]
+    assert run(folder, "--out", tmp_path / "told", *flags) == 0
+    told, _ = read_replay(tmp_path / "told")
+    assert told["expected_costs"] == pytest.approx({"free": 0.0, "paid": 0.05, "hopeless": 0.01})
+    for entry in told["selectors"].values():
+        assert entry["ci95"][0] < entry["mean_reward"] < entry["ci95"][1] or entry.get("policy") == "hopeless"
+    assert all(pair["ci95"][0] < pair["ci95"][1] for pair in told["paired"])
+    assert run(folder, "--out", tmp_path / "untold", *flags, "--unknown-costs") == 0
+    assert read_replay(tmp_path / "untold")[0]["expected_costs"] is None
+
+
+def test_a_log_of_scores_counts_them_as_success_and_is_reported(tmp_path: Path):
+    """As `ingest --metric action-mse` leaves it; and neither times nor prices are there to weigh."""
+    generator = np.random.default_rng(0)
+    unknown = dict.fromkeys(("upload", "inference", "download", "motion", "price", "steps", "subgoals"))
+    contexts = {f"i{number}": generator.normal(size=8) for number in range(40)}
+    rows = [make_row(key, name, success=False, score=-float(generator.random()), **unknown) for key in contexts for name in ("a", "b")]
+    folder = write_log(tmp_path / "log", rows, contexts)
+    write_rollouts(folder, rows, {"encoder": "made_up@1", "source": {"metric": "action-mse"}})
+    flags = ["--alpha-time", "0", "--alpha-price", "0"]
+    assert run(folder, "--selectors", "linucb", "--seeds", 2, "--workers", 1, "--out", tmp_path / "out", *flags) == 0
+    result, _ = read_replay(tmp_path / "out")
+    assert result["reward"]["success"] == "score" and -1.0 < result["selectors"]["linucb"]["mean_reward"] < -0.1
+    assert set(result["frontier"]) == {"seeds", "decisions"}, "there is no weight to move"
+    assert result["selectors"]["linucb"]["mean_score"] == pytest.approx(result["selectors"]["linucb"]["mean_reward"])
+    for source in (tmp_path / "out", folder):
+        page = tmp_path / f"page-{source.name}"
+        assert report.main([str(source), "--out", str(page), *(flags if source == folder else [])]) == 0
+        assert not (page / "figures" / "frontier.png").exists()
+        assert "neither times nor prices" in (page / "report.html").read_text()
+    assert "mean_score" in (tmp_path / "page-out" / "tables" / "selectors.csv").read_text().splitlines()[0]
+
+
+def test_a_gap_that_may_be_none_has_no_interval():
+    generator = np.random.default_rng(0)
+    base = generator.random((6, 50))
+    better = base + generator.normal(0.02, 0.5, (6, 50))
+    nothing = np.zeros(RESAMPLES)
+    close = Curves({}, {"best_single": base, "expected": better}, "expected", 40, nothing)
+    far = Curves({}, {"best_single": base, "expected": base + 1.0}, "expected", 40, nothing)
+    assert 0.0 < (better - base).mean() < 0.1
+    share, interval = gap_closed(better, close, "expected", 0)
+    assert share == pytest.approx(1.0) and interval is None
+    share, interval = gap_closed(base + 0.5, far, "expected", 0)
+    assert (share, *interval) == pytest.approx((0.5, 0.5, 0.5))
+    assert gap_closed(base, Curves({}, {"best_single": base, "expected": base - 1.0}, "expected", 40, nothing), "expected", 0) is None
 
 
 def test_a_warm_start_spares_the_beginning(tmp_path: Path, log):

@@ -2,6 +2,7 @@
 
 import base64
 import csv
+import io
 import json
 import re
 import sys
@@ -10,14 +11,18 @@ from urllib.parse import unquote
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from PIL import Image
 from report_helpers import EVIL, FAR, NEAR, WEIGHTS, made_log, made_replay, made_run
+from synthetic_log import make_row, write_log
 
 from osel_sim import report
 from osel_sim.errors import UsageError
 from osel_sim.offline.estimate import Estimate, mean_of, rate_of
+from osel_sim.offline.log import read_log
 from osel_sim.reporting import episodes
-from osel_sim.reporting.description import Bars, Column, Figure, Heat, Line, Panel, Points, Table, thinned
+from osel_sim.reporting.description import DARK, LIGHT, Bars, Column, Figure, Heat, Line, Panel, Points, Table, colours, thinned
 from osel_sim.reporting.episodes import MOST_EPISODES, list_episodes
+from osel_sim.reporting.log_sections import context_figure, policy_blocks, time_figure
 from osel_sim.reporting.matplotlib_figures import to_images
 from osel_sim.reporting.plotly_figures import to_plotly
 from osel_sim.reporting.selector_sections import MAIN, style_of
@@ -223,6 +228,97 @@ def test_thinned_keeps_ends_and_the_beginning():
     assert kept[0] == 0 and kept[-1] == 9_999 and len(kept) <= 200
     assert set(range(5)) <= set(kept.tolist())
     assert thinned(5).tolist() == [0, 1, 2, 3, 4]
+
+
+def made_table(folder, groups, seed=None, **values):
+    """A log from elsewhere: some groups of three instances each; `large` is better in all of them but the last two."""
+    rows, contexts = [], {}
+    for group in range(groups):
+        for number in range(3):
+            key = f"g{group:02d}/{number}"
+            contexts[key] = np.eye(8)[group % 8] + 0.01 * number
+            for policy in ("small", "large"):
+                about = {"task": f"subject_{group:02d}", "seed": seed, "level": None, "split": None, "upload": None, "download": None, "motion": None}
+                success = (policy == "large") == (group < groups - 2)
+                rows.append(make_row(key, policy, success=success, **about, inference=0.4, price=0.04 if policy == "large" else 0.0, **values))
+    return read_log(write_log(folder, rows, contexts))
+
+
+def test_every_one_of_many_groups_has_a_row(tmp_path):
+    (figure,) = [block for block in policy_blocks(made_table(tmp_path, 30), WEIGHTS) if isinstance(block, Figure)]
+    for panel in figure.panels:
+        assert len(panel.rows) == 31 and panel.rows[0] == "all"
+        # What there is to route by comes first: the groups in which the best policy of all is behind.
+        assert set(panel.rows[1:3]) == {"subject 28", "subject 29"}
+        assert all(len(np.asarray(mark.y)) == 31 for mark in panel.marks)
+    assert "in the first 2 of 30 groups it is behind" in figure.caption
+    drawn = to_plotly(figure)["panels"][0]
+    assert drawn["layout"]["yaxis"]["ticktext"] == list(figure.panels[0].rows) and drawn["layout"]["yaxis"]["range"] == [30.5, -0.5]
+    few = made_table(tmp_path / "few", 5)
+    assert all(isinstance(mark, Bars) for block in policy_blocks(few, WEIGHTS) if isinstance(block, Figure) for mark in block.panels[0].marks)
+
+
+def test_a_cloud_of_many_groups_shows_the_largest_and_the_rest(tmp_path):
+    panel = context_figure(made_table(tmp_path, 30), WEIGHTS).panels[0]
+    assert [mark.colour for mark in panel.marks].count("muted") == 1
+    assert panel.marks[0].name == "19 others" and len(panel.marks) == 12
+    assert sum(len(np.asarray(mark.x)) for mark in panel.marks) == 90
+    panel = context_figure(made_table(tmp_path / "fewer", 20), WEIGHTS).panels[0]
+    assert len({(mark.colour, mark.symbol) for mark in panel.marks}) == 20
+
+
+def test_images_grow_with_what_is_in_them():
+    def height(panel):
+        return Image.open(io.BytesIO(to_images(Figure("f", "F", "", [panel]))["png"])).height
+
+    clouds = [Points(f"group {number}", [number], [1.0]) for number in range(60)]
+    few, many = Panel("", "", "", clouds[:2], bare=True), Panel("", "", "", clouds, bare=True)
+    assert height(many) > height(few) + 12 * 15  # twelve more lines of legend do not take the room of the plot
+    short, long = (Panel("", "", "y", [Bars(who, [8 * name for name in "abcdefgh"], range(8)) for who in ("p", "q")]) for _ in range(2))
+    long = Panel("", "", "y", [Bars(mark.name, [f"{name} and so on and on" for name in mark.categories], mark.y) for mark in long.marks])
+    assert height(long) > height(short)
+    assert height(Panel("", "", "", clouds[:2], rows=[str(row) for row in range(60)])) > 1.5 * height(few)
+
+
+def test_seventeen_ways_of_choosing_have_a_colour_each():
+    found = colours([str(number) for number in range(17)])
+    for palette in (LIGHT, DARK):
+        assert len({palette[name] for name in found.values()}) == 17
+    assert LIGHT.keys() == DARK.keys()
+
+
+def test_prices_show_three_digits_whatever_their_size():
+    def texts(*values, digits=None):
+        table = Table("t", "T", "", [Column("x", "x", digits=digits)], [{"x": value} for value in values])
+        return [to_text(row["x"], table.columns[0]) for row in table.rows]
+
+    assert texts(0.04, Estimate(0.1195, 0.1, 0.12), None) == ["0.040", "0.119 [0.100, 0.120]", "–"]
+    assert texts(16.88, 0.454, 0.0) == ["16.9", "0.5", "0.0"]
+    assert texts(1234.5) == ["1,234.5"] and texts(0.0) == ["0.0"] and texts(float("nan")) == ["–"]
+    assert texts(0.04, digits=1) == ["0.0"]
+    assert to_text(0.00071, Column("", "", digits=None)) == "0.000710"
+
+
+def test_grades_are_shown_where_they_tell_more_than_success(tmp_path):
+    def columns(log):
+        table = policy_blocks(log, WEIGHTS)[0]
+        return {column.key for column in table.columns}, list_episodes(log, WEIGHTS).data["episodes"]
+
+    keys, data = columns(made_table(tmp_path / "plain", 4))
+    assert not {"subgoals", "score"} & (keys | data.keys())
+    keys, data = columns(made_table(tmp_path / "graded", 4, subgoals=0.75, score=-0.0123))
+    assert {"subgoals", "score"} <= keys
+    assert data["subgoals"][0] == 0.75 and data["score"][0] == -0.0123
+
+
+def test_a_log_from_elsewhere_is_told_no_tales(tmp_path, log):
+    other = made_table(tmp_path, 4)
+    assert "virtual clock" in time_figure(log).caption and "without network" in time_figure(log).caption
+    assert "virtual" not in time_figure(other).caption and "without network" not in time_figure(other).caption
+    assert all(instance["drawable"] for instance in list_episodes(log, WEIGHTS).data["instances"])
+    book = list_episodes(other, WEIGHTS).data
+    assert not any("drawable" in instance for instance in book["instances"])
+    assert book["digits"]["price"] == 4
 
 
 def test_many_episodes_are_thinned_by_instance(tmp_path):

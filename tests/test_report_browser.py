@@ -4,8 +4,10 @@ import shutil
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from report_helpers import EVIL, FAR, made_log, made_replay, made_run
+from synthetic_log import make_row, write_log
 
 from osel_sim import report
 
@@ -42,9 +44,24 @@ def pages(tmp_path_factory):
     log = made_log(folder / "log")
     made_replay(folder / "replay", log)
     made_run(folder / "run")
-    for name in ("log", "replay", "run"):
+    made_table(folder / "table")
+    names = ("log", "replay", "run", "table")
+    for name in names:
         assert report.main([str(folder / name)]) == 0
-    return {name: folder / name / "report.html" for name in ("log", "replay", "run")}
+    return {name: folder / name / "report.html" for name in names}
+
+
+def made_table(folder: Path) -> None:
+    """A log from elsewhere, without seeds: thirty subjects, graded, cheap."""
+    rows, contexts = [], {}
+    for number in range(90):
+        key = f"question/{number}"
+        contexts[key] = np.eye(8)[number % 8] + 0.01 * number
+        for policy in ("small", "large"):
+            about = {"task": f"a rather long name of the subject {number % 30}", "seed": None, "level": None, "split": None}
+            values = {"subgoals": 0.75, "score": -0.0123, "price": 0.04}
+            rows.append(make_row(key, policy, success=(number + (policy == "large")) % 3 > 0, **about, **values))
+    write_log(folder, rows, contexts)
 
 
 @pytest.fixture
@@ -73,7 +90,7 @@ def wait(driver, script: str, seconds: float = 90.0) -> None:
         time.sleep(0.1)
 
 
-@pytest.mark.parametrize("name", ["log", "replay", "run"])
+@pytest.mark.parametrize("name", ["log", "replay", "run", "table"])
 @pytest.mark.parametrize(("phone", "dark"), [(False, False), (True, True)])
 def test_everything_is_drawn(driver, pages, show, name, phone, dark):
     show(pages[name], phone, dark)
@@ -149,6 +166,49 @@ def test_filters(driver, pages, show):
     driver.execute_script("document.getElementById('episode-more').click()")
     assert len(driver.execute_script("return document.querySelectorAll('#episode-list button')")) == 78
     assert not driver.execute_script("return document.getElementById('episode-more').checkVisibility()")
+
+
+def test_a_filter_offers_what_there_is_and_says_when_nothing_fits(driver, pages, show):
+    outcomes = "return [...document.getElementById('filter-outcome').options].map((option) => option.value)"
+    show(pages["table"])
+    assert driver.execute_script(outcomes) == ["", "success", "failure"]
+    script = "const box = document.getElementById('filter-text'); box.value = 'zzz'; box.dispatchEvent(new Event('input'));"
+    driver.execute_script(script)
+    assert driver.execute_script("return document.getElementById('episode-list').textContent") == "No episode fits."
+    assert not driver.execute_script("return document.getElementById('episode-more').checkVisibility()")
+    show(pages["log"])
+    assert driver.execute_script(outcomes) == ["", "success", "failure", "fallback"]
+
+
+def test_an_episode_tells_its_grades_and_how_to_get_a_picture(driver, pages, show):
+    def detail(name: str) -> str:
+        show(pages[name])
+        driver.execute_script("document.querySelector('#episode-list button').click()")
+        return driver.execute_script("return document.getElementById('detail-body').innerText")
+
+    words = detail("table")
+    assert "subgoals 75%" in words and "score \u22120.0123" in words and "0.0400 cents" in words
+    assert "--scenes" not in words  # nothing can draw it
+    words = detail("log")
+    assert "--scenes N" in words and "subgoals" not in words
+
+
+def test_a_phone_keeps_the_names_of_rows_and_shortens_those_of_a_figure(driver, pages, show):
+    show(pages["table"], phone=True)
+    left = """
+        const table = document.querySelector('#table-policies .wide');
+        table.scrollLeft = 200;
+        const cells = [...table.querySelectorAll('tbody tr:first-child td')].slice(0, 2);
+        return [table.scrollLeft, table.getBoundingClientRect().left,
+            ...cells.map((cell) => cell.getBoundingClientRect().left), cells[1].getBoundingClientRect().right];"""
+    scrolled, start, first, second, end = driver.execute_script(left)
+    assert scrolled > 100 and first == pytest.approx(start + 1, abs=2) and first < second < end < 390 / 2 + start
+    names = "return [...document.querySelectorAll('#figure-policies_by_task .plot')].map((plot) => plot.querySelectorAll('.ytick').length)"
+    assert driver.execute_script(names) == [31, 31]
+    longest = "return Math.max(...[...document.querySelectorAll('#figure-policies_by_task .ytick text')].map((text) => text.textContent.length))"
+    assert driver.execute_script(longest) <= 20
+    show(pages["table"])
+    assert driver.execute_script(longest) > 30
 
 
 def test_a_live_run_shows_what_was_chosen_first(driver, pages, show):

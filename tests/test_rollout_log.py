@@ -95,7 +95,7 @@ def test_what_goes_in_comes_out_and_equal_logs_are_equal_bytes(tmp_path):
 
 
 def test_wrong_logs_are_refused(tmp_path):
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(DataError, match=r"does not exist; python -m osel_sim\.record or, from a table, python -m osel_sim\.ingest with --out"):
         read_rollouts(tmp_path)
     (tmp_path / "rollouts.parquet").write_text("no parquet")
     with pytest.raises(DataError, match="not a Parquet file"):
@@ -120,6 +120,67 @@ def test_a_log_of_version_1_is_read_without_scores_and_axes(tmp_path):
         read_rollouts(tmp_path)
     pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"3 or so"}), file)
     with pytest.raises(DataError, match="metadata cannot be read"):
+        read_rollouts(tmp_path)
+
+
+def changed(folder, **columns):
+    """A log of three rows, with other columns instead of what was written; what reading it says."""
+    write_rollouts(folder, [row(seed) for seed in range(3)], {})
+    file = folder / "rollouts.parquet"
+    table = pyarrow.parquet.read_table(file)
+    for name, values in columns.items():
+        table = table.set_column(table.schema.get_field_index(name), name, values)
+    pyarrow.parquet.write_table(table, file)
+    return read_rollouts(folder)[0]
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "says"),
+    [
+        ("success", ["True", "False", "True"], "column 'success' must hold true and false, its type is string"),
+        ("success", [1, 0, 1], "column 'success' must hold true and false, its type is int64"),
+        ("subgoals", ["0.5", "1", "0"], "column 'subgoals' must hold numbers, its type is string"),
+        ("steps", [1.5, 2.0, 3.0], "column 'steps' must hold integers, its type is double"),
+        ("policy", [1, 2, 3], "column 'policy' must hold text, its type is int64"),
+        ("instruction", [b"a", b"b", b"c"], "column 'instruction' must hold text, its type is binary"),
+        ("target", [["a"], [], []], "column 'target' must hold text, its type is list"),
+        ("policy", ["a", None, "c"], "column 'policy', row 2: is empty, every row needs one"),
+        ("repeat", pyarrow.nulls(3), "column 'repeat', row 1: is empty, every row needs one"),
+        ("repeat", [0, 0, -1], "column 'repeat', row 3: must be 0 or more"),
+        ("success", [True, None, None], "column 'success', row 2: is empty, and error does not say why"),
+        ("success", pyarrow.nulls(3), "column 'success', row 1: is empty, and error does not say why"),
+    ],
+)
+def test_columns_of_another_kind_are_refused(column, values, says, tmp_path):
+    with pytest.raises(DataError, match=r"^[^\n]*rollouts\.parquet: [^\n]*$") as refused:
+        changed(tmp_path, **{column: pyarrow.array(values)})
+    assert says in str(refused.value)
+
+
+def test_columns_that_others_write_otherwise_are_read(tmp_path):
+    columns = {
+        "task": pyarrow.array(["pick_place"] * 3).dictionary_encode(),
+        "policy": pyarrow.array(["small"] * 3, pyarrow.large_string()),
+        "repeat": pyarrow.array([0, 0, 0], pyarrow.int32()),
+        "price": pyarrow.array([3, 3, 3]),
+        "subgoals": pyarrow.array([0.5, 0.5, 0.5], pyarrow.float32()),
+        "score": pyarrow.nulls(3),
+        "success": pyarrow.array([True, None, True]),
+        "error": pyarrow.array([None, "died", None]),
+    }
+    expected = [row(seed, price=3, subgoals=0.5) for seed in range(3)]
+    expected[1] = replace(expected[1], success=False, error="died")
+    assert changed(tmp_path, **columns) == expected
+    write_rollouts(tmp_path, [], {})
+    assert read_rollouts(tmp_path)[0] == []
+
+
+def test_a_torn_log_gets_one_line(tmp_path):
+    write_rollouts(tmp_path, [row(seed) for seed in range(300)], {})
+    file = tmp_path / "rollouts.parquet"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:300] + bytes(500) + whole[800:])
+    with pytest.raises(DataError, match=r"^[^\n]* is not a whole Parquet file [^\n]*$"):
         read_rollouts(tmp_path)
 
 
@@ -202,3 +263,4 @@ def test_tables_tell_tasks_and_levels_apart_where_there_are_several(capsys):
 def test_share_best_counts_complete_instances_only():
     rows = [row(0, "small", price=0.0), row(0, "large"), row(2, "small"), row(2, "large", price=0.0), row(4, "small", error="died"), row(4, "large")]
     assert share_best(rows, ["small", "large"], preset("oxe")) == {"small": 0.5, "large": 0.5}
+    assert share_best(rows[4:], ["small", "large"], preset("oxe")) == {}

@@ -44,6 +44,8 @@ def test_tfidf_of_few_or_wordless_texts():
     assert encoder.encode((), "only one").shape == (encoder.dimension,)
     with pytest.raises(UsageError, match="there is no word in the 1 texts"):
         TfidfEncoder(["?!"])
+    with pytest.raises(UsageError, match="have a single word between them"):
+        TfidfEncoder(["x", "x x"])
 
 
 def test_open_clip_encoders_give_their_text_half_where_there_are_no_images():

@@ -89,7 +89,7 @@ class TfidfEncoder:
         texts: all texts of the log; a context depends on all of them, and so does the identity.
 
     Raises:
-        UsageError: there is no word in the texts.
+        UsageError: there is no word in the texts, or only one.
     """
 
     name = TFIDF
@@ -107,6 +107,8 @@ class TfidfEncoder:
             table = self._words.fit(different).transform(different)
         except ValueError:
             raise UsageError(f"encoder {TFIDF!r}: there is no word in the {len(different)} texts; name another encoder") from None
+        if table.shape[1] < 2:
+            raise UsageError(f"encoder {TFIDF!r}: the {len(different)} texts have a single word between them; name another encoder")
         self.dimension = max(1, min(dimension, *table.shape))
         self._axes: Any = TruncatedSVD(self.dimension, algorithm="randomized", n_iter=4, random_state=0)
         with np.errstate(invalid="ignore"):  # the share of variance that a single text explains, which nobody asks for

@@ -91,7 +91,10 @@ def write_replay(folder: Path, result: Mapping[str, Any], choices: Choices, tabl
         (folder / REPLAY).unlink(missing_ok=True)
         _replace(folder / CHOICES, content)
         for name, rows in tables.items():
-            _replace(folder / f"{name}.csv", _csv(rows))
+            if rows:
+                _replace(folder / f"{name}.csv", _csv(rows))
+            else:
+                (folder / f"{name}.csv").unlink(missing_ok=True)
         write_json(folder / REPLAY, {"schema_version": SCHEMA_VERSION, **result, "choices_sha256": digest})
     except OSError as error:
         raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None

@@ -122,19 +122,22 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
     """Rows and metadata of a rollout log.
 
     Raises:
-        DataError: no log there, or one of another form.
+        DataError: no log there, or one of another form; names the column that is wrong.
     """
     import pyarrow
     import pyarrow.parquet
 
     file = folder / ROLLOUTS
     if not file.is_file():
-        raise DataError(f"{file} does not exist; python -m osel_sim.record --out {folder} writes it")
+        raise DataError(
+            f"{file} does not exist; python -m osel_sim.record or, from a table, python -m osel_sim.ingest with --out {folder} writes it; "
+            "the same command goes on with an interrupted one"
+        )
     try:
-        table = pyarrow.parquet.read_table(file)
+        found = pyarrow.parquet.read_schema(file)
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(f"{file} is not a Parquet file ({error})") from None
-    raw = table.schema.metadata or {}
+    raw = found.metadata or {}
     try:
         metadata = {key.removeprefix(_PREFIX).decode(): json.loads(value) for key, value in raw.items() if key.startswith(_PREFIX)}
     except ValueError as error:
@@ -144,9 +147,51 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
         raise DataError(f"{file}: osel_sim.schema_version must be 1 to {SCHEMA_VERSION}, got {version}")
     later = {name for since, names in _COLUMNS_ADDED.items() if since > version for name in names}
     columns = [name for name in schema().names if name not in later]
-    if table.schema.names != columns:
-        raise DataError(f"{file}: columns must be {', '.join(columns)}; got {', '.join(table.schema.names)}")
-    return [Row(**row) for row in table.to_pylist()], metadata
+    if found.names != columns:
+        raise DataError(f"{file}: columns must be {', '.join(columns)}; got {', '.join(found.names)}")
+    _check_types(file, found)
+    try:
+        table = pyarrow.parquet.read_table(file)
+        table.validate(full=True)  # text is UTF-8
+    except (pyarrow.ArrowException, OSError) as error:
+        raise DataError(f"{file} is not a whole Parquet file ({' '.join(str(error).split())})") from None
+    return [Row(**row) for row in _checked(file, table).to_pylist()], metadata
+
+
+def _check_types(file: Path, found: "pyarrow.Schema") -> None:
+    """Refuse columns of another kind. How wide a number is, or how text is encoded, does not matter: others write logs too."""
+    import pyarrow
+
+    types = pyarrow.types
+    for field, expected in zip(found, map(schema().field, found.names), strict=True):
+        kind = field.type
+        words = kind.value_type if types.is_dictionary(kind) else kind
+        fits, content = {
+            pyarrow.string(): (types.is_string(words) or types.is_large_string(words), "text"),
+            pyarrow.int64(): (types.is_integer(kind), "integers"),
+            pyarrow.float64(): (types.is_floating(kind) or types.is_integer(kind), "numbers"),
+            pyarrow.bool_(): (types.is_boolean(kind), "true and false"),
+        }[expected.type]
+        if not fits and not types.is_null(kind):  # null: the column is empty
+            raise DataError(f"{file}: column {field.name!r} must hold {content}, its type is {kind}")
+
+
+def _checked(file: Path, table: "pyarrow.Table") -> "pyarrow.Table":
+    """The table, if every row has what it needs. No success beside an error is false: there was no valid outcome."""
+    import pyarrow.compute
+
+    def refuse(column: str, wrong: Any, problem: str) -> None:
+        row = pyarrow.compute.index(wrong, True).as_py()
+        if row >= 0:
+            raise DataError(f"{file}: column {column!r}, row {row + 1}: {problem}")
+
+    for name in ("task", "instance", "policy", "repeat"):
+        refuse(name, table[name].is_null(), "is empty, every row needs one")
+    missing = table["success"].is_null()
+    refuse("success", pyarrow.compute.and_(missing, table["error"].is_null()), "is empty, and error does not say why")
+    refuse("repeat", pyarrow.compute.less(table["repeat"], 0), "must be 0 or more")
+    success = pyarrow.compute.fill_null(table["success"].cast(pyarrow.bool_()), False)
+    return table.set_column(table.schema.get_field_index("success"), "success", success)
 
 
 def _type_name(kind: object) -> str:

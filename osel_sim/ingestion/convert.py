@@ -1,14 +1,14 @@
 """Rows of an outcome table as rows of the rollout log."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from osel_sim.errors import DataError, UnknownNameError
 from osel_sim.formats.rollout_log import Row
-from osel_sim.ingestion.mapping import Mapping, PolicyColumns, Success, Term, fill
+from osel_sim.ingestion.mapping import Mapping, PolicyColumns, Success, Term, fill, threshold
 from osel_sim.ingestion.tables import Record, number, text
 
 _TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0")
@@ -41,12 +41,14 @@ class Converted:
         sources: an entry for each instance, in the order of the table.
         policies: names in the log, in the order of the mapping or of their appearance.
         dropped: rows that were left out as duplicates.
+        differing: those of them that say something else than the row that was kept.
     """
 
     rows: list[Row]
     sources: list[Source]
     policies: list[str]
     dropped: int
+    differing: int
 
 
 def convert(mapping: Mapping, records: Sequence[Record]) -> Converted:
@@ -62,18 +64,21 @@ def convert(mapping: Mapping, records: Sequence[Record]) -> Converted:
     keys: dict[tuple[Any, ...], str] = {}
     counters: dict[str, int] = {}
     names = {policy.name: None for policy in mapping.policies.values()}
-    dropped = 0
+    dropped = differing = 0
     for record in records:
         source, known = _source(mapping, record, sources, keys, counters)
         if mapping.policy is None:
             if known and mapping.repeat is None and mapping.duplicates in ("refuse", "drop"):
                 if mapping.duplicates == "refuse":
-                    raise _duplicate(record, sources[source.key].record, f"instance {source.key!r}")
+                    raise _duplicate(mapping, record, sources[source.key].record, f"instance {source.key!r}")
                 dropped += 1
+                kept = [outcomes.get((source.key, policy.name, 0)) for policy in mapping.policies.values()]
+                again = [_row(mapping, record, source, policy, 0) for policy in mapping.policies.values()]
+                differing += again != [pair and pair[0] for pair in kept]
                 continue
             policies = list(mapping.policies.values())
         else:
-            policies = [_policy(mapping, record)]
+            policies = [_policy(mapping, record, names)]
             names.setdefault(policies[0].name)
         sources.setdefault(source.key, source)
         repeat = _repeat(mapping, record)
@@ -87,8 +92,9 @@ def convert(mapping: Mapping, records: Sequence[Record]) -> Converted:
                 row = Row(**{**vars(row), "repeat": place[2]})
             if place in outcomes:
                 if mapping.duplicates != "drop":
-                    raise _duplicate(record, outcomes[place][1], f"instance {source.key!r}, policy {policy.name!r}, repeat {row.repeat}")
+                    raise _duplicate(mapping, record, outcomes[place][1], f"instance {source.key!r}, policy {policy.name!r}, repeat {row.repeat}")
                 dropped += 1
+                differing += row != outcomes[place][0]
                 continue
             outcomes[place] = row, record
     ran = {policy for _, policy, _ in outcomes}
@@ -98,8 +104,8 @@ def convert(mapping: Mapping, records: Sequence[Record]) -> Converted:
     order = {key: index for index, key in enumerate(sources)}, {name: index for index, name in enumerate(names)}
     places = sorted(outcomes, key=lambda place: (order[0][place[0]], order[1][place[1]], place[2]))
     with_outcome = {place[0] for place in places}
-    kept = [source for key, source in sources.items() if key in with_outcome]
-    return Converted([outcomes[place][0] for place in places], kept, list(names), dropped)
+    used = [source for key, source in sources.items() if key in with_outcome]
+    return Converted([outcomes[place][0] for place in places], used, list(names), dropped, differing)
 
 
 def _source(
@@ -119,21 +125,31 @@ def _source(
             )
         return first, True
     if known and mapping.key:
-        raise _duplicate(record, sources[keys[identity]].record, f"instance {keys[identity]!r}")
+        raise _duplicate(mapping, record, sources[keys[identity]].record, f"instance {keys[identity]!r}")
     counters[task] = counters.get(task, 0) + 1
     key = f"{task}/{identity[1] if mapping.key else format(counters[task], '06d')}"
     keys[identity] = key
     return Source(key, task, words, images, record), False
 
 
-def _policy(mapping: Mapping, record: Record) -> PolicyColumns:
+def _policy(mapping: Mapping, record: Record, names: Collection[str]) -> PolicyColumns:
+    """The policy that a row of a long table is about; `names` are those of earlier rows."""
     column = mapping.policy or ""  # only called for long tables
     name = text(record, column)
     if name in mapping.policies:
         return mapping.policies[name]
     if mapping.default is None:
-        raise record.error(column, str(UnknownNameError("policy", name, mapping.policies, str(mapping.file))))
-    return PolicyColumns(name, mapping.default.success, mapping.default.numbers, mapping.default.error)
+        where = "--policies" if mapping.from_flags else str(mapping.file)
+        raise record.error(column, str(UnknownNameError("policy", name, mapping.policies, where)))
+    alike = None if name in names else next((other for other in names if _plain(other) == _plain(name)), None)
+    if alike is not None:
+        way = "after --policies" if mapping.from_flags else "as [policies.NAME]"
+        raise record.error(column, f"policy {name!r} and {alike!r} differ only in capitals or spaces; write both alike, or name all policies {way}")
+    return replace(mapping.default, name=name)
+
+
+def _plain(name: str) -> str:
+    return " ".join(name.casefold().split())
 
 
 def _repeat(mapping: Mapping, record: Record) -> int | None:
@@ -146,14 +162,14 @@ def _repeat(mapping: Mapping, record: Record) -> int | None:
 
 
 def _row(mapping: Mapping, record: Record, source: Source, policy: PolicyColumns, repeat: int) -> Row | None:
-    error = record.values[policy.error] if policy.error is not None else None
-    success = False if error is not None else _success(record, policy.success)
+    error = text(record, policy.error) if policy.error is not None and record.values[policy.error] is not None else None
+    success = False if error is not None else _success(mapping, record, policy.success)
     if success is None:
         return None
     numbers: dict[str, float | None] = {}
     if error is None:
         for name, terms in policy.numbers.items():
-            numbers[name] = _number(record, name, terms)
+            numbers[name] = _number(record, policy, name, terms)
     if any(name in numbers for name in _WAITING):
         # The three are parts of one wait: what the table does not tell apart is not waited for twice.
         numbers = {**dict.fromkeys(_WAITING, 0.0), **numbers}
@@ -182,12 +198,12 @@ def _row(mapping: Mapping, record: Record, source: Source, policy: PolicyColumns
         actions=None,
         price=numbers.get("price"),
         fallback=None,
-        error=None if error is None else str(error),
+        error=error,
         score=numbers.get("score"),
     )
 
 
-def _success(record: Record, success: Success) -> bool | None:
+def _success(mapping: Mapping, record: Record, success: Success) -> bool | None:
     """None where the policy did not run."""
     value = record.values[success.column]
     if value is None:
@@ -204,18 +220,27 @@ def _success(record: Record, success: Success) -> bool | None:
         return word in _TRUE
     if word == "nan":
         raise record.error(success.column, "is NaN; leave it empty where the policy did not run")
-    hint = "; a graded outcome is a score, and its success a threshold: success = { column = ..., at_least = ... }" if _is_number(value) else ""
-    raise record.error(success.column, f"must be true or false (or 1 or 0), got {value!r}{hint}")
+    if _is_number(value):
+        hint = f"a graded outcome is a score, and its success a threshold: {threshold(mapping.from_flags)}"
+    else:
+        hint = "a mapping file (--map) says which words mean it: success = { column = ..., true = [WORDS], false = [WORDS] }"
+    raise record.error(success.column, f"must be true or false (or 1 or 0), got {value!r}; {hint}; leave it empty where the policy did not run")
 
 
-def _number(record: Record, name: str, terms: Sequence[Term]) -> float:
+def _number(record: Record, policy: PolicyColumns, name: str, terms: Sequence[Term]) -> float:
     total = math.fsum(_term(record, term) for term in terms)
-    column = next((term.column for term in terms if term.column is not None), name)
+    called = policy.called(name)
+    column = next((term.column for term in terms if term.column is not None), None)
+
+    def error(problem: str) -> DataError:
+        problem = f"{called} must {problem}, got {total:g}"
+        return DataError(f"{record.where}, policy {policy.name!r}: {problem}") if column is None else record.error(column, problem)
+
     low, high = (-math.inf, math.inf) if name == "score" else (0.0, 1.0) if name == "subgoals" else (0.0, math.inf)
     if not low <= total <= high:
-        raise record.error(column, f"{name} must lie in [{low:g}, {high:g}], got {total:g}")
+        raise error(f"lie in [{low:g}, {high:g}]")
     if name == "steps" and total != int(total):
-        raise record.error(column, f"steps must be an integer, got {total:g}")
+        raise error("be an integer")
     return total
 
 
@@ -245,11 +270,12 @@ def _divided(record: Record, value: float, divide: str) -> float:
     return value / by
 
 
-def _duplicate(record: Record, first: Record, what: str) -> DataError:
-    return DataError(
-        f"{record.where}: {what} is in row {first.number} of {first.file} already; remove one, name a column of repeats, "
-        'or say what it means with duplicates = "drop" or "repeats" (in a wide table also "keep")'
-    )
+def _duplicate(mapping: Mapping, record: Record, first: Record, what: str) -> DataError:
+    if mapping.from_flags:
+        ways = "name a column of repeats (--repeat-column), or say what it means: --duplicates drop or repeats (in a wide table also keep)"
+    else:
+        ways = 'name a column of repeats, or say what it means with duplicates = "drop" or "repeats" (in a wide table also "keep")'
+    return DataError(f"{record.where}: {what} is in row {first.number} of {first.file} already; remove one, {ways}")
 
 
 def _is_number(value: Any) -> bool:

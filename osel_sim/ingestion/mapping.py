@@ -21,7 +21,8 @@
     [policies."gpt-4-1106-preview"]              # what differs
     price = [{ column = "prompt", count = "characters", scale = 0.00025 }, 0.003]
 
-A long table (a row for each instance and policy) names its column of policies: `outcome.policy = "model"`.
+A long table (a row for each instance and policy) names its column of policies: `outcome.policy = "model"`. Where other words than true and false mean
+success: `success = { column = "solved", true = ["yes"], false = ["no"] }`.
 """
 
 import re
@@ -35,7 +36,13 @@ Count = Literal["value", "characters", "words"]
 
 NUMBERS = ("score", "subgoals", "steps", "upload", "inference", "download", "motion", "price")
 """What a mapping may give for each policy besides success, by the log's names."""
+VALUES = ("success", "score", "subgoals", "steps", "seconds", "upload", "inference", "download", "motion", "price", "error")
+"""Keys of each policy in a mapping, each of them a flag as well."""
 LABELS = ("split", "phrasing", "target", "container")
+COMMAND_LINE = "command line"
+"""What a mapping made of flags has in place of its file."""
+_FLAGS = {"instance.images": "--image", "outcome.policy": "--policy-column", "outcome.repeat": "--repeat-column"}
+"""Flags that are not called what their key is called."""
 FIELD = re.compile(r"\{([^{}]+)\}")
 """A column's name in a template."""
 
@@ -80,19 +87,30 @@ class PolicyColumns:
         name: in the log.
         numbers: name in the log -> the terms whose sum it is.
         error: column that says why there is no valid outcome; empty where there is one.
+        total: the mapping gives `inference` as `seconds`, the total.
     """
 
     name: str
     success: Success
     numbers: dict[str, tuple[Term, ...]]
     error: str | None = None
+    total: bool = False
 
     @property
-    def columns(self) -> list[str]:
-        """All columns it needs."""
-        terms = [term for number in self.numbers.values() for term in number]
-        optional = [self.success.divide, self.error, *(term.column for term in terms), *(term.divide for term in terms)]
-        return list(dict.fromkeys([self.success.column, *(name for name in optional if name is not None)]))
+    def columns(self) -> dict[str, str]:
+        """All columns it needs -> what they are needed for, as the mapping calls it."""
+        needed: list[tuple[str | None, str]] = [(self.success.column, "success"), (self.success.divide, "success"), (self.error, "error")]
+        for name, terms in self.numbers.items():
+            needed += [(column, self.called(name)) for term in terms for column in (term.column, term.divide)]
+        columns: dict[str, str] = {}
+        for column, name in needed:
+            if column is not None:
+                columns.setdefault(column, name)
+        return columns
+
+    def called(self, number: str) -> str:
+        """What the mapping calls a number of the log."""
+        return "seconds" if number == "inference" and self.total else number
 
 
 @dataclass(frozen=True)
@@ -108,7 +126,7 @@ class Mapping:
     """A mapping, validated.
 
     Attributes:
-        file: the TOML file, or `command line`.
+        file: the TOML file, or `COMMAND_LINE`.
         base: folder that the files are relative to.
         name: of the workload; the task of instances without a group.
         text: template of the instruction or question: columns in braces.
@@ -140,6 +158,11 @@ class Mapping:
     default: PolicyColumns | None = None
 
     @property
+    def from_flags(self) -> bool:
+        """Whether it is made of the command line's flags, which errors then speak of."""
+        return self.file == COMMAND_LINE
+
+    @property
     def columns(self) -> dict[str, str]:
         """Columns it needs -> the key that asks for them."""
         needed = {name: "instance.text" for name in FIELD.findall(self.text)}
@@ -153,9 +176,26 @@ class Mapping:
         ):
             if column is not None:
                 needed[column] = key
-        for policy in [*self.policies.values(), *([self.default] if self.default else [])]:
-            needed |= {column: f"outcome of policy {policy.name!r}" if self.policies else "outcome" for column in policy.columns}
+        for name, policy in self.policies.items():
+            needed |= {column: f"policies.{name}.{key}" for column, key in policy.columns.items()}
+        if self.default is not None:
+            needed |= {column: f"outcome.{key}" for column, key in self.default.columns.items()}
         return needed
+
+
+def flag(key: str) -> str:
+    """The flag that stands for a mapping's key: `--text` for `instance.text`, `--price of policy 'large'` for `policies.large.price`."""
+    section, _, rest = key.partition(".")
+    policy, _, value = rest.rpartition(".")
+    if value == "at_least":
+        return "--at-least"
+    name = _FLAGS.get(key, f"--{value or section}")
+    return f"{name} of policy {policy!r}" if section == "policies" and policy else name
+
+
+def threshold(from_flags: bool) -> str:
+    """How a mapping says that a number is success from somewhere on, for error messages."""
+    return "--success COLUMN --at-least X" if from_flags else "success = { column = ..., at_least = ... }"
 
 
 def fill(template: str, text: Callable[[str], str]) -> str:

@@ -1,14 +1,31 @@
 """Reading a mapping: a TOML file, or the command line's flags as the same table."""
 
+import re
 from pathlib import Path
 from typing import Any, get_args
 
 from osel_sim.formats.validate import Table
-from osel_sim.ingestion.mapping import FIELD, LABELS, NUMBERS, Count, Duplicates, Join, Mapping, PolicyColumns, Success, Term
+from osel_sim.ingestion.mapping import (
+    COMMAND_LINE,
+    FIELD,
+    LABELS,
+    NUMBERS,
+    VALUES,
+    Count,
+    Duplicates,
+    Join,
+    Mapping,
+    PolicyColumns,
+    Success,
+    Term,
+    threshold,
+)
 
 VERSION = 1
 _PLACE = "{policy}"
 _ANY = (str, int, float, bool, list, dict)
+_OUTCOMES = ("success", "score", "subgoals")
+"""What tells the policies of a table apart; what an action costs may well be the same for all."""
 
 
 def load_mapping(file: Path, files: tuple[str, ...] = ()) -> Mapping:
@@ -46,6 +63,10 @@ def parse_mapping(table: Table, base: Path, files: tuple[str, ...] = ()) -> Mapp
     text = instance.get("text", str)
     if not text:
         raise instance.error("text", "must be a column, or a template with columns in braces")
+    if re.search(r"[{}]", FIELD.sub("", text)):
+        raise instance.error(
+            "text", f"{text!r} has a brace too many or too few; {{COLUMN}} stands for a column's text, other braces a text cannot have"
+        )
     if not FIELD.search(text):
         text = "{" + text + "}"
     labels = {label: instance.get(label, str) for label in LABELS if label in instance.data}
@@ -96,16 +117,17 @@ def _files(table: Table) -> tuple[str, ...]:
 
 def _policies(section: Table, outcome: Table, column: str | None) -> tuple[dict[str, PolicyColumns], PolicyColumns | None]:
     """Columns of each policy, and of those that are not named."""
-    keys = ("success", "error", *NUMBERS, "seconds")
-    common = {key: outcome.get(key, _ANY, None) for key in keys if key in outcome.data}
+    common = {key: outcome.get(key, _ANY, None) for key in VALUES if key in outcome.data}
     policies: dict[str, PolicyColumns] = {}
     for name in section.data:
         part = section.table(name)
-        own = {key: part.get(key, _ANY) for key in keys if key in part.data}
+        own = {key: part.get(key, _ANY) for key in VALUES if key in part.data}
         title = part.get("name", str, name)
-        merged = Table({**common, **own}, section.file, f"{part.prefix}")
+        merged = type(section)({**common, **own}, section.file, part.prefix)
         policies[name] = _columns(merged, name, title)
         part.done()
+    if column is None:
+        _own_outcomes(section, outcome, common)
     titles = [policy.name for policy in policies.values()]
     for title in titles:
         if titles.count(title) > 1:
@@ -117,9 +139,23 @@ def _policies(section: Table, outcome: Table, column: str | None) -> tuple[dict[
                 "NAME",
                 "is missing: a wide table needs [policies.NAME] for each policy, a long one outcome.policy, its column of policies",
             )
-        default = _columns(Table(common, section.file, outcome.prefix), _PLACE, "")
+        default = _columns(type(section)(common, section.file, outcome.prefix), _PLACE, "")
     _same_measures(section, policies)
     return policies, default
+
+
+def _own_outcomes(section: Table, outcome: Table, common: dict[str, Any]) -> None:
+    """What a wide table says for all policies must not give several of them the outcome of one."""
+    for key in _OUTCOMES:
+        value = common.get(key)
+        heirs = [name for name in section.data if key not in section.data[name]]
+        if len(heirs) > 1 and isinstance(value, str | list | dict) and _PLACE not in str(value):
+            way = "--policy-column" if _from_flags(outcome) else "outcome.policy"
+            raise outcome.error(
+                key,
+                f"is {value!r} for each of {', '.join(heirs)}; let {_PLACE} in it stand for the policy's name, or give each policy its own; "
+                f"if the table is long, name its column of policies ({way})",
+            )
 
 
 def _same_measures(section: Table, policies: dict[str, PolicyColumns]) -> None:
@@ -129,15 +165,14 @@ def _same_measures(section: Table, policies: dict[str, PolicyColumns]) -> None:
             lacking = [number for number in first.numbers if number not in policy.numbers]
             if lacking:
                 raise section.error(
-                    f"{name}.{lacking[0]}",
+                    f"{name}.{first.called(lacking[0])}",
                     f"is missing, policy {first.name!r} has it; give it for all (0 where it is free or takes no time)",
                 )
 
 
 def _columns(table: Table, name: str, title: str) -> PolicyColumns:
     if "success" not in table.data:
-        hint = 'success = { column = "C", at_least = 0.5 } takes a score from 0.5 on as success'
-        raise table.error("success", f"is missing; {hint}")
+        raise table.error("success", f"is missing; {threshold(_from_flags(table))} takes a score from so much on as success")
     success = _success(table, name)
     numbers: dict[str, tuple[Term, ...]] = {}
     for key in NUMBERS:
@@ -149,7 +184,7 @@ def _columns(table: Table, name: str, title: str) -> PolicyColumns:
             raise table.error("seconds", f"is the total, where its parts are not known; {clash[0]} is given as well")
         numbers["inference"] = _terms(table, "seconds", name)
     error = table.get("error", str, None)
-    return PolicyColumns(title, success, numbers, None if error is None else error.replace(_PLACE, name))
+    return PolicyColumns(title, success, numbers, None if error is None else error.replace(_PLACE, name), "seconds" in table.data)
 
 
 def _success(table: Table, name: str) -> Success:
@@ -184,7 +219,7 @@ def _term(table: Table, key: str, value: Any, name: str) -> Term:
     if isinstance(value, str):
         return Term(value.replace(_PLACE, name))
     if isinstance(value, int | float) and not isinstance(value, bool):
-        return Term(offset=Table({key: value}, table.file, table.prefix).number(key, -1e12, 1e12))
+        return Term(offset=type(table)({key: value}, table.file, table.prefix).number(key, -1e12, 1e12))
     if not isinstance(value, dict):
         raise table.error(key, f"must be a column, a number, a table with column, count, scale, divide and offset, or a list of these; got {value!r}")
     part = Table(value, table.file, f"{table.prefix}{key}.")
@@ -198,6 +233,10 @@ def _term(table: Table, key: str, value: Any, name: str) -> Term:
     )
     part.done()
     return term
+
+
+def _from_flags(table: Table) -> bool:
+    return table.file == COMMAND_LINE
 
 
 def _literal(table: Table, key: str, known: tuple[Any, ...], default: str) -> Any:

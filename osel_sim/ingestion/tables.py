@@ -11,11 +11,12 @@ from typing import Any
 
 from osel_sim import cli
 from osel_sim.errors import DataError
-from osel_sim.ingestion.mapping import Join, Mapping
+from osel_sim.ingestion.mapping import Join, Mapping, flag
 
 _CAPTURE = re.compile(r"\\\{([A-Za-z_][A-Za-z0-9_]*)\\\}")
 _LONGEST_FIELD = 64 * 1024 * 1024
-SUFFIXES = (".csv", ".tsv", ".jsonl", ".ndjson", ".parquet")
+DELIMITERS = {".csv": ",", ".tsv": "\t"}
+SUFFIXES = (*DELIMITERS, ".jsonl", ".ndjson", ".parquet")
 
 
 @dataclass(frozen=True)
@@ -55,10 +56,8 @@ def read_tables(mapping: Mapping) -> list[Record]:
     columns = records[0].values.keys()
     for column, key in mapping.columns.items():
         if column not in columns:
-            raise DataError(
-                f"{records[0].file}: there is no column {column!r}, which {mapping.file} names as {key}: "
-                f"{cli.did_you_mean(column, columns)}columns: {', '.join(columns)}"
-            )
+            who = f"{flag(key)} names" if mapping.from_flags else f"{mapping.file} names as {key}"
+            raise DataError(f"{records[0].file}: there is no column {column!r}, which {who}: {_instead(records[0], column)}")
     return records
 
 
@@ -121,8 +120,8 @@ def _read(file: Path) -> list[Record]:
     try:
         if suffix == ".parquet":
             rows = list(_parquet(file))
-        elif suffix in (".csv", ".tsv"):
-            rows = list(_delimited(file, "," if suffix == ".csv" else "\t"))
+        elif suffix in DELIMITERS:
+            rows = list(_delimited(file, DELIMITERS[suffix]))
         else:
             rows = list(_json_lines(file))
     except UnicodeDecodeError as error:
@@ -153,12 +152,15 @@ def _delimited(file: Path, delimiter: str) -> Iterator[Record]:
                     if len(fields) != len(header):
                         raise DataError(
                             f"{file}, row {number} (line {start}): has {len(fields)} fields, the header has {len(header)}; "
-                            "the file was cut, or a quote is missing"
+                            "the file was cut, or a quote is missing" + _other_delimiter(file, header)
                         )
                     yield Record(file, number, start, {name: text or None for name, text in zip(header, fields, strict=True)})
                 start = reader.line_num + 1
     except csv.Error as error:
-        raise DataError(f"{file}: the row that begins at line {start} cannot be read ({error}); the file was cut or a quote is wrong") from None
+        raise DataError(
+            f"{file}: the row that begins at line {start} cannot be read ({error}); "
+            f"the file was cut, a quote is wrong, or it is not separated by {delimiter!r}"
+        ) from None
     finally:
         csv.field_size_limit(before)
 
@@ -170,8 +172,10 @@ def _json_lines(file: Path) -> Iterator[Record]:
             if not text.strip():
                 continue
             try:
-                value = json.loads(text)
-            except ValueError as error:
+                value = json.loads(text, object_pairs_hook=_without_repetition)
+            except DataError as error:
+                raise DataError(f"{file}, line {line}: {error}") from None
+            except (ValueError, RecursionError) as error:
                 raise DataError(f"{file}, line {line}: is not JSON ({error}); every line must be one object, the file may have been cut") from None
             if not isinstance(value, dict):
                 raise DataError(f"{file}, line {line}: must be an object, got {type(value).__name__}")
@@ -179,7 +183,16 @@ def _json_lines(file: Path) -> Iterator[Record]:
     # A key that is left out is an empty cell.
     columns = list(dict.fromkeys(name for _, row in rows for name in row))
     for number, (line, row) in enumerate(rows, start=1):
-        yield Record(file, number, line, {name: _empty_as_none(row.get(name)) for name in columns})
+        yield Record(file, number, line, {name: _cell(row.get(name)) for name in columns})
+
+
+def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in result:
+            raise DataError(f"key {name!r} is there twice")
+        result[name] = value
+    return result
 
 
 def _parquet(file: Path) -> Iterator[Record]:
@@ -187,19 +200,22 @@ def _parquet(file: Path) -> Iterator[Record]:
     import pyarrow.parquet
 
     try:
-        table = pyarrow.parquet.read_table(file)
-        rows = table.to_pylist()
+        names = pyarrow.parquet.read_schema(file).names
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise DataError(f"{file}: column {twice!r} is there twice")
+        rows = pyarrow.parquet.read_table(file).to_pylist()
     except (pyarrow.ArrowException, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{file}: is not a whole Parquet file ({reason})") from None
     for number, row in enumerate(rows, start=1):
-        yield Record(file, number, None, {name: _empty_as_none(value) for name, value in row.items()})
+        yield Record(file, number, None, {name: _cell(value) for name, value in row.items()})
 
 
 def _joined(records: list[Record], others: list[Record], join: Join) -> list[Record]:
     for side in (records[0], others[0]):
         if join.on not in side.values:
-            raise DataError(f"{side.file}: there is no column {join.on!r} to join on; columns: {', '.join(side.values)}")
+            raise DataError(f"{side.file}: there is no column {join.on!r} to join on: {_instead(side, join.on)}")
     clash = (records[0].values.keys() & others[0].values.keys()) - {join.on}
     if clash:
         raise DataError(f"{others[0].file}: column {min(clash)!r} is in {records[0].file} as well; rename one; only {join.on!r} may be in both")
@@ -218,7 +234,32 @@ def _joined(records: list[Record], others: list[Record], join: Join) -> list[Rec
     return result
 
 
-def _empty_as_none(value: Any) -> Any:
+def _instead(record: Record, column: str) -> str:
+    """What may have been meant by a column that is not there."""
+    columns = list(record.values)
+    return f"{cli.did_you_mean(column, columns)}columns: {', '.join(columns)}" + _other_delimiter(record.file, columns, column)
+
+
+def _other_delimiter(file: Path, columns: Sequence[str], missing: str | None = None) -> str:
+    """A hint where a column's name looks like a header with another delimiter, being the only one or having the missing column in it."""
+    own = DELIMITERS.get(file.suffix.lower())
+    for name in columns if own else ():
+        for delimiter in (";", "\t", "|", ","):
+            parts = [part.strip() for part in name.split(delimiter)]
+            if delimiter != own and len(parts) > 1 and (len(columns) == 1 or missing in parts):
+                right = next((suffix for suffix, other in DELIMITERS.items() if other == delimiter), None)
+                way = f"name it {right}" if right else "write it with one of these"
+                return f"; it seems to be separated by {delimiter!r}, but a .csv is by ',' and a .tsv by '\\t': {way}"
+    return ""
+
+
+def _cell(value: Any) -> Any:
+    """A cell as it was read: an empty one is None, and bytes are the text they encode, if they do."""
+    if isinstance(value, bytes):
+        try:
+            value = value.decode()
+        except UnicodeDecodeError:
+            return value
     return None if value == "" else value
 
 
@@ -231,15 +272,13 @@ def number(record: Record, column: str) -> float | None:
     value = record.values[column]
     if value is None:
         return None
-    if isinstance(value, str):
-        try:
-            value = float(value)
-        except ValueError:
-            raise record.error(column, f"must be a number, got {value!r}") from None
-    if isinstance(value, bool) or not hasattr(value, "__float__"):
+    numeric = isinstance(value, str) or hasattr(value, "__float__")
+    if isinstance(value, bool) or not numeric or (isinstance(value, str) and "_" in value):  # Python takes 1_000 for a number
         raise record.error(column, f"must be a number, got {value!r}")
     try:
         result = float(value)
+    except ValueError:
+        raise record.error(column, f"must be a number, got {value!r}") from None
     except OverflowError:  # an integer of hundreds of digits
         raise record.error(column, "must be a finite number, got a far larger one") from None
     if not math.isfinite(result):
@@ -251,11 +290,18 @@ def text(record: Record, column: str) -> str:
     """A cell as text.
 
     Raises:
-        DataError: it is empty, or holds a list or an object.
+        DataError: it is empty, or holds a list, an object, or what cannot be written as UTF-8.
     """
     value = record.values[column]
     if value is None:
         raise record.error(column, "is empty, expected text")
+    if isinstance(value, bytes):
+        raise record.error(column, f"must be text, got {len(value)} bytes that are not UTF-8")
     if isinstance(value, list | dict) or (isinstance(value, float) and not math.isfinite(value)):
         raise record.error(column, f"must be text, got {value!r}")
-    return str(value)
+    result = str(value)
+    try:
+        result.encode()
+    except UnicodeEncodeError as error:
+        raise record.error(column, f"must be text, got {result[error.start]!r} in it, which is only half of a character") from None
+    return result

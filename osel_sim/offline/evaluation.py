@@ -29,6 +29,10 @@ def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
     if not valid.any():
         raise DataError(f"{log.source}: none of {len(log)} decisions has a reward")
     rewards, chosen, propensities, contexts = received[valid], live.chosen[valid], live.propensities[valid], log.contexts[valid]
+    # An episode that ends in error has no reward. Where that happens to some policies more than to others, what is left has fewer decisions of
+    # those than the run meant to make: each counts as chosen with the probability of being chosen and of ending well.
+    share = np.array([valid[live.chosen == column].mean() if (live.chosen == column).any() else 1.0 for column in range(len(log.policies))])
+    propensities = propensities * share / valid.mean()
     model = forward_model(contexts, rewards, chosen, len(log.policies))
     targets = {f"fixed:{policy}": np.tile(np.eye(len(log.policies))[column], (len(rewards), 1)) for column, policy in enumerate(log.policies)}
     targets |= {"random": np.full_like(propensities, 1.0 / len(log.policies)), "greedy": greedy(model)}

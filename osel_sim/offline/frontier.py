@@ -30,19 +30,18 @@ class Frontier:
     Attributes:
         name: `hindsight oracle`, or `best policy of each cluster`.
         weights: (K,) the weight that sweeps; the other is as given.
-        score, seconds, price: (K,) means over the instances; the score is what the reward counts as success.
+        means: what `measured` names -> (K,) means over the instances.
     """
 
     name: str
     weights: Array
-    score: Array
-    seconds: Array
-    price: Array
+    means: dict[str, Array]
 
 
 def measured(log: LoggedOutcomes, weights: RewardWeights) -> dict[str, Array]:
-    """What a frontier shows of every episode, (N, P, R) each."""
-    return {"score": score_of(log, weights), "seconds": log.seconds, "price": log.price}
+    """What a frontier shows of every episode, (N, P, R) each: `score` (what the reward counts as success), `seconds` or `steps`, and `price`."""
+    time = {"steps": log.steps} if weights.time_unit == "steps" else {"seconds": log.seconds}
+    return {"score": score_of(log, weights), **time, "price": log.price}
 
 
 def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWeights, sweep: Axis, high: float) -> list[Frontier]:
@@ -60,7 +59,7 @@ def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWei
     part, own = log.take(rows), labels[rows]
     first = part.first_half()
     values = np.concatenate([[0.0], np.geomspace(high / 10_000, high, _POINTS - 1)])
-    tables = [mean_over_repeats(table) for table in measured(part, weights).values()]
+    tables = {key: mean_over_repeats(table) for key, table in measured(part, weights).items()}
     choosers: dict[str, Chooser] = {"hindsight oracle": lambda rewards: rewards.argmax(axis=1)}
     if first.any() and not first.all():
         choosers["best policy of each cluster"] = lambda rewards: _by_cluster(rewards, own, first)
@@ -68,7 +67,8 @@ def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWei
     for name, choose in choosers.items():
         columns = [choose(part.mean_rewards(moved(weights, sweep, float(value)))) for value in values]
         every = np.arange(len(part))
-        found.append(Frontier(name, values, *(np.array([_mean(table[every, chosen]) for chosen in columns]) for table in tables)))
+        means = {key: np.array([_mean(table[every, chosen]) for chosen in columns]) for key, table in tables.items()}
+        found.append(Frontier(name, values, means))
     return found
 
 
@@ -92,8 +92,8 @@ def selector_frontiers(
         progress: called with a number of decisions made, and that of all there will be.
 
     Returns:
-        seeds, decisions, and of each weight that can be moved: weights [K] from 0, selectors {name: {score, seconds, price}}, [K] each, None where
-        unknown.
+        seeds, decisions, and of each weight that can be moved: weights [K] from 0, selectors {name: means as `measured` names them}, [K] each, None
+        where unknown.
 
     Raises:
         DataError: there are too few instances for clusters, which say up to where to look.

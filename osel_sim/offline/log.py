@@ -126,13 +126,15 @@ class LoggedOutcomes:
     def expected_costs(self, weights: RewardWeights) -> dict[str, float]:
         """What a policy is charged for time and price on average where it succeeds: reward = success - cost.
 
-        Stands for what `osel_sim.costs` computes from a policy's file, which a log does not have. A policy that never succeeds, or has no valid
-        outcome, is left out.
+        Stands for what `osel_sim.costs` computes from a policy's file, which a log does not have. Of a policy that never succeeds it is the average
+        over all its episodes; one without any valid outcome is left out.
         """
         score: Array = getattr(self, weights.success)
         costs = score - self.rewards(weights)
-        known = np.isfinite(costs) & (self.success > 0.5)
-        return {policy: float(costs[:, column][known[:, column]].mean()) for column, policy in enumerate(self.policies) if known[:, column].any()}
+        known = np.isfinite(costs)
+        solved = known & (self.success > 0.5)
+        counted = np.where(solved.any(axis=(0, 2), keepdims=True), solved, known)
+        return {policy: float(costs[:, column][counted[:, column]].mean()) for column, policy in enumerate(self.policies) if counted[:, column].any()}
 
     def mean_rewards(self, weights: RewardWeights) -> Array:
         """Mean reward over the repeats, (N, P); NaN where a policy has none on an instance."""

@@ -80,7 +80,7 @@ def units(values: Array) -> Array:
 def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -> dict[str, Any]:
     """One selector: what `replay.json` says about it under `selectors`."""
     received = rewards.selectors[name]
-    of_each = {"success": log.success, "subgoals": log.subgoals, "steps": log.steps, "seconds": log.seconds, "price": log.price}
+    of_each = {"success": log.success, "subgoals": log.subgoals, "score": log.score, "steps": log.steps, "seconds": log.seconds, "price": log.price}
     got = {what: _mean(choices.received(name, values)) for what, values in of_each.items()}
     chosen = choices.chosen[name]
     late = slice(rewards.late, None)
@@ -92,6 +92,7 @@ def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -
         "success_rate": got["success"],
         "success_ci95": list(bootstrap_mean_interval(units(successes))) if got["success"] is not None else None,
         "mean_subgoals": got["subgoals"],
+        "mean_score": got["score"],
         "mean_steps": got["steps"],
         "mean_seconds": got["seconds"],
         "mean_price": got["price"],

@@ -22,7 +22,7 @@ class PolicyResult:
         instances: on which it has a valid outcome.
         episodes, errors: valid ones, and those that ended in error (never counted as failures).
         success: share of the instances solved.
-        reward, steps, seconds, price: means; price in cents.
+        subgoals, score, reward, steps, seconds, price: means; price in cents.
     """
 
     group: str
@@ -31,6 +31,8 @@ class PolicyResult:
     episodes: int
     errors: int
     success: Estimate | None
+    subgoals: Estimate | None
+    score: Estimate | None
     reward: Estimate | None
     steps: Estimate | None
     seconds: Estimate | None
@@ -64,7 +66,7 @@ def per_group(log: LoggedOutcomes, weights: RewardWeights, attribute: str = "tas
             int(np.isfinite(log.success[rows, column]).sum()),
             int(log.errors[rows, column].sum()),
             rate_of(log.success[rows, column]),
-            *(mean_of(mean_over_repeats(values[rows, column])) for values in (rewards, log.steps, seconds, log.price)),
+            *(mean_of(mean_over_repeats(values[rows, column])) for values in (log.subgoals, log.score, rewards, log.steps, seconds, log.price)),
         )
         for group, rows in groups(log, attribute).items()
         for column, policy in enumerate(log.policies)

@@ -85,7 +85,7 @@ def verdict(rewards: Curves, learners: Sequence[str], measured: Mapping[str, Map
             "gain_bounds": [advantage.low, advantage.high],
             "gain_late": advantage.late,
             "gain_late_bounds": [advantage.late_low, advantage.late_high],
-            **{key: _difference(mine[key], fixed[key]) for key in ("success_rate", "mean_seconds", "mean_price")},
+            **{key: _difference(mine[key], fixed[key]) for key in ("success_rate", "mean_seconds", "mean_steps", "mean_price")},
         }
     decisions = rewards.oracles["best_single"].shape[1]
     text = _text(decision, best, policy, found.get(best) if best else None, stake, decisions)
@@ -105,8 +105,10 @@ def verdict(rewards: Curves, learners: Sequence[str], measured: Mapping[str, Map
 
 
 def _text(decision: str, best: str | None, policy: str, advantage: Advantage | None, stake: Mapping[str, Any], decisions: int) -> str:
-    bound = "" if stake["learnable_oracle"] == "expected" else " that knows task, object, container and phrasing"
+    bound = "" if stake["learnable_oracle"] == "expected" else " that knows what group (task, object, phrasing ...) an instance is of"
     limit = f"An oracle{bound} gains {stake['learnable_gain']:+.3f} a decision over it."
+    if stake["learnable_gain"] <= 0.0:
+        limit = f"Nothing to learn can be seen: an oracle{bound} gains nothing over it."
     if best is None or advantage is None:
         return f"Do not route: always use {policy}. {limit}"
     whole = f"{advantage.mean:+.3f} reward a decision over {decisions} decisions (between {advantage.low:+.3f} and {advantage.high:+.3f})"
@@ -122,10 +124,17 @@ def _effects(stake: Mapping[str, Any]) -> str:
     if stake.get("success_rate") is not None:
         parts.append(f"{100 * stake['success_rate']:+.1f} points of success")
     if stake.get("mean_seconds") is not None:
-        parts.append(f"{stake['mean_seconds']:+.2f} s")
+        parts.append(f"{_signed(stake['mean_seconds'])} s")
+    elif stake.get("mean_steps") is not None:
+        parts.append(f"{stake['mean_steps']:+.1f} steps")
     if stake.get("mean_price") is not None:
-        parts.append(f"{stake['mean_price']:+.2f} cents")
+        parts.append(f"{_signed(stake['mean_price'])} cents")
     return f"That is {', '.join(parts)} a decision. " if parts else ""
+
+
+def _signed(value: float) -> str:
+    """Two decimals, or two digits of what is smaller: prices by the token are hundredths of a cent."""
+    return f"{value:+.2f}" if abs(value) >= 0.095 or value == 0.0 else f"{value:+.2g}"
 
 
 def _difference(one: float | None, other: float | None) -> float | None:

@@ -28,7 +28,7 @@ class Replayed:
     """What the frontier shows of selectors.
 
     Attributes:
-        points: score, seconds and price of each at the weights given.
+        points: of each at the weights given, as `osel_sim.offline.frontier.measured` names it.
         swept: what they came to at others, as `osel_sim.offline.frontier.selector_frontiers` gives it; None where that was not replayed.
         colour: of each.
         shown: those drawn without being asked for.
@@ -85,7 +85,7 @@ def weights_blocks(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[
     points: list[Mark] = [
         Points(name, [other.alpha_time], [other.alpha_price], "ink", size=13, symbol="star", labelled=True)
         if name == "these weights"
-        else Points(f"preset {name}", [other.alpha_time], [other.alpha_price], "muted", symbol="diamond", labelled=True)
+        else Points(name, [other.alpha_time], [other.alpha_price], "ink", size=9, symbol="diamond", labelled=True)
         for name, other in inside.items()
         if name == "these weights" or (other.alpha_time, other.alpha_price) != (weights.alpha_time, weights.alpha_price)
     ]
@@ -111,14 +111,13 @@ def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routin
     own, label, scale = colours(log.policies), *score_label(weights)
     panels = []
     for found in routing.ranges:
-        against, x_label = ("seconds", "mean seconds") if found.axis == "alpha_time" else ("price", "mean price (cents)")
-        if not np.isfinite(tables[against]).any():
-            continue  # time may be counted in steps, of a log without seconds
+        against = "price" if found.axis == "alpha_price" else "steps" if weights.time_unit == "steps" else "seconds"
+        x_label = "mean price (cents)" if against == "price" else f"mean {against}"
         other = "alpha_price" if found.axis == "alpha_time" else "alpha_time"
         marks: list[Mark] = []
         for frontier, dash in zip(frontiers(log, routing.clustering.labels, weights, found.axis, found.limit), (True, False), strict=False):
-            x, texts = getattr(frontier, against), [f"{found.axis} {value:.3g}" for value in frontier.weights]
-            marks.append(Line(frontier.name, x, scale * frontier.score, "ink", dash=dash, dots=True, texts=texts))
+            x, texts = frontier.means[against], [f"{found.axis} {value:.3g}" for value in frontier.weights]
+            marks.append(Line(frontier.name, x, scale * frontier.means["score"], "ink", dash=dash, dots=True, texts=texts))
         for column, policy in enumerate(log.policies):
             if np.isfinite(tables[against][column]):
                 marks.append(

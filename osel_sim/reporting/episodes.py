@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.offline.log import Array, LoggedOutcomes
+from osel_sim.reporting.description import digits_of, shortened
 from osel_sim.reporting.page import Episodes
 from osel_sim.selection.reward import RewardWeights
 
@@ -27,7 +28,10 @@ MOST_VIDEO_BYTES = 6_000_000
 Scenes = Callable[[LoggedOutcomes], Mapping[int, bytes]]
 """Draws how some instances of a log begin: instance -> JPEG."""
 
-_NUMBERS = {"reward": 4, "steps": 0, "seconds": 3, "upload": 3, "inference": 3, "download": 3, "motion": 3, "price": 3}
+_NUMBERS = {"reward": 4, "steps": 0, "seconds": 3, "upload": 3, "inference": 3, "download": 3, "motion": 3, "price": 6}
+_GRADED = {"subgoals": 3, "score": 6}
+"""Only where they tell more than success."""
+
 _FRAMES = 5
 _FRAME_HEIGHT = 168
 
@@ -70,6 +74,7 @@ def list_episodes(
         "repeat": [repeat for _, _, repeat in places],
         "success": [_number(log.success[place], 3) for place in places],
         **{name: [_number(values[place], _NUMBERS[name]) for place in places] for name, values in measures.items()},
+        **{name: [_number(getattr(log, name)[place], _GRADED[name]) for place in places] for name in graded(log)},
         "fallback": [found.get(place, {}).get("fallback") for place in places],
         "error": [found.get(place, {}).get("error") or ("ended in error" if log.errors[place] else None) for place in places],
         "video": [f"{row}/{policy}" if (row, policy) in (videos or {}) else None for row, policy, _ in places],
@@ -81,15 +86,18 @@ def list_episodes(
         "instances": [_instance(log, row, (scenes or {}).get(row)) for row in kept],
         "episodes": episodes,
         "videos": _videos(videos or {}, beside),
+        "digits": {
+            name: digits_of(value for value in episodes[name] if value is not None) for name in ("seconds", "price", "score") if name in episodes
+        },
         "picks": {name: [[_number(share, 2) for share in shares[row]] for row in kept] for name, shares in (picks or {}).items()},
     }
     note = "All episodes." if len(kept) == len(log) else f"{len(kept):,} of {len(log):,} instances, spread evenly over them."
     return Episodes(note, data)
 
 
-def shortened(text: str, most: int) -> str:
-    """The text, cut with an ellipsis where it is longer."""
-    return text if len(text) <= most else text[: most - 1] + "…"
+def graded(log: LoggedOutcomes) -> list[str]:
+    """Measures, of subgoals and score, that tell more of some episode than its success."""
+    return [name for name in _GRADED if (np.isfinite(getattr(log, name)) & (getattr(log, name) != log.success)).any()]
 
 
 def _kept(ran: NDArray[np.bool_], pictured: set[int]) -> list[int]:
@@ -107,6 +115,9 @@ def _instance(log: LoggedOutcomes, row: int, scene: bytes | None) -> dict[str, A
     for name in ("instruction", "target", "container", "phrasing"):
         if value := getattr(instance, name):
             about[name] = shortened(value, MOST_LETTERS)
+    # What osel_sim.report can draw with --scenes: an instance of a task file, which its seed makes again.
+    if instance.seed is not None and instance.level is not None and instance.split is not None:
+        about["drawable"] = True
     if scene is not None:
         about["scene"] = base64.b64encode(scene).decode()
     return about

@@ -1,7 +1,6 @@
 """The page of a rollout log, and the sections that the pages of replays and live runs share with it."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -9,7 +8,7 @@ from osel_sim.errors import DataError
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.offline.clusters import complete_instances
 from osel_sim.offline.estimate import Estimate
-from osel_sim.offline.log import LoggedOutcomes, read_log
+from osel_sim.offline.log import LoggedOutcomes
 from osel_sim.offline.outcomes import remote_policies
 from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, cluster_blocks, frontier_figure, weights_blocks
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
@@ -18,19 +17,18 @@ from osel_sim.reporting.page import Block, Page, Section, Tile, Verdict
 from osel_sim.selection.reward import RewardWeights
 
 
-def log_page(folder: Path, weights: RewardWeights, scenes: Scenes = no_scenes) -> Page:
+def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_scenes) -> Page:
     """The page of a rollout log: what its policies came to, and whether there is something to route by.
 
     Args:
         scenes: draws how some of its instances begin.
 
     Raises:
-        DataError: no log there, or it lacks what the weights ask for.
+        DataError: the log lacks what the weights ask for.
     """
-    log = read_log(folder)
     sections, routing = log_sections(log, weights)
     title = f"{few(sorted(set(log.labels('task'))))}: {len(log):,} instances, {len(log.policies)} policies"
-    rows, _ = read_rollouts(folder)
+    rows, _ = read_rollouts(log.source)
     episodes = list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes(log))
     return Page("Rollout log", title, _verdict(log, weights, routing), sections, log_facts(log, weights), episodes)
 

@@ -6,13 +6,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from osel_sim.reporting.description import LIGHT, Bars, Figure, Heat, Line, Panel, Points
+from osel_sim.reporting.description import LIGHT, MOST_ROW_LETTERS, Bars, Figure, Heat, Line, Panel, Points, shortened
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
 
 _SYMBOLS = {"circle": "o", "diamond": "D", "x": "x", "star": "*"}
 _COLUMNS = 2
+_WIDTH, _HEIGHT, _ROW, _TITLE = 5.6, 3.2, 0.2, 0.45
+"""Inches: of a panel, of what is drawn in it, of each of its named rows, and of the figure's title."""
 
 
 def to_images(figure: Figure, dpi: int = 130) -> dict[str, bytes]:
@@ -23,14 +26,16 @@ def to_images(figure: Figure, dpi: int = 130) -> dict[str, bytes]:
 
     columns = min(_COLUMNS, len(figure.panels))
     rows = -(-len(figure.panels) // columns)
-    canvas = Canvas(figsize=(5.6 * columns + (2.4 if columns == 1 else 0), 4.2 * rows), layout="constrained")
+    heights = [max(_height(panel) for panel in figure.panels[row * columns : (row + 1) * columns]) for row in range(rows)]
+    canvas = Canvas(figsize=(_WIDTH * columns + (2.4 if columns == 1 else 0), sum(heights) + rows + _TITLE), layout="constrained")
     FigureCanvasAgg(canvas)
-    axes = canvas.subplots(rows, columns, squeeze=False)
+    axes = canvas.subplots(rows, columns, squeeze=False, height_ratios=heights)
     for place, axis in enumerate(axes.flat):
         if place < len(figure.panels):
             _draw(axis, figure.panels[place])
         else:
             axis.set_axis_off()
+    _make_room(canvas, axes, heights)
     canvas.suptitle(_plain(figure.title), fontsize=12, color=LIGHT["ink"])
     images: dict[str, bytes] = {}
     # Without a date and with ids of its own the SVG depends on nothing but the figure.
@@ -40,6 +45,38 @@ def to_images(figure: Figure, dpi: int = 130) -> dict[str, bytes]:
             canvas.savefig(buffer, format=ending, dpi=dpi, metadata=metadata)
             images[ending] = buffer.getvalue()
     return images
+
+
+def _height(panel: Panel) -> float:
+    return max(_HEIGHT, _ROW * len(panel.rows))
+
+
+def _make_room(canvas: "Canvas", axes: Any, heights: list[float]) -> None:
+    """Put the legends below the labels, and make the figure as high as all of it needs, so that nothing is squeezed or lies on another."""
+    from matplotlib.transforms import ScaledTranslation
+
+    around = np.zeros(axes.shape)
+    for place, axis in np.ndenumerate(axes):
+        box = axis.get_window_extent()
+        labels = axis.xaxis.get_tightbbox()  # None where the axis is off or bare
+        below = max(0.0, (box.y0 - labels.y0) / canvas.dpi) if labels is not None else 0.0
+        handles, names = axis.get_legend_handles_labels()
+        unique = dict(zip(names, handles, strict=True))
+        if len(unique) > 1:
+            fit = int((_WIDTH - 0.2) / (0.45 + 0.06 * max(map(len, unique))))
+            down = axis.transAxes + ScaledTranslation(0.0, -below - 0.04, canvas.dpi_scale_trans)
+            form = {"fontsize": 7, "frameon": False, "loc": "upper center", "borderaxespad": 0.3}
+            axis.legend(
+                list(unique.values()),
+                list(unique),
+                ncols=min(len(unique), max(1, fit), 5),
+                bbox_to_anchor=(0.5, 0.0),
+                bbox_transform=down,
+                **form,
+            )
+        whole = axis.get_tightbbox()
+        around[place] = 0.0 if whole is None else (whole.height - box.height) / canvas.dpi
+    canvas.set_figheight(sum(heights) + float(around.max(axis=1).sum()) + 0.12 * len(heights) + _TITLE)
 
 
 def _draw(axis: "Axes", panel: Panel) -> None:
@@ -71,21 +108,19 @@ def _draw(axis: "Axes", panel: Panel) -> None:
         axis.set_yscale("log")
     if panel.y_range is not None:
         axis.set_ylim(*panel.y_range)
+    if panel.rows:
+        axis.set_yticks(range(len(panel.rows)), [_plain(shortened(name, MOST_ROW_LETTERS)) for name in panel.rows], fontsize=8)
+        axis.set_ylim(len(panel.rows) - 0.5, -0.5)
+        axis.xaxis.tick_top()
+        axis.xaxis.set_label_position("top")
     if panel.bare:
         axis.set_xticks([])
         axis.set_yticks([])
     if not panel.bare and not any(isinstance(mark, Heat) for mark in panel.marks):
         axis.grid(color=LIGHT["grid"], linewidth=0.7)
     axis.set_axisbelow(True)
-    for side in ("top", "right"):
+    for side in ("bottom" if panel.rows else "top", "right"):
         axis.spines[side].set_visible(False)
-    handles, labels = axis.get_legend_handles_labels()
-    unique = dict(zip(labels, handles, strict=True))
-    if len(unique) > 1:
-        # Below the axes, as in the page: there it hides nothing, and no place for it has to be searched.
-        below = -0.04 if panel.bare else -0.17 if not bars else -0.3
-        columns = min(len(unique), 3 if max(map(len, unique)) > 16 else 4)
-        axis.legend(list(unique.values()), list(unique), fontsize=7, frameon=False, ncols=columns, loc="upper center", bbox_to_anchor=(0.5, below))
 
 
 def _line(axis: "Axes", mark: Line, label: str) -> None:
@@ -109,10 +144,14 @@ def _points(axis: "Axes", mark: Points, label: str) -> None:
     colour, x, y = LIGHT[mark.colour], np.asarray(mark.x, np.float64), np.asarray(mark.y, np.float64)
     if mark.x_interval is not None or mark.y_interval is not None:
         axis.errorbar(x, y, xerr=_errors(x, mark.x_interval), yerr=_errors(y, mark.y_interval), fmt="none", ecolor=colour, alpha=0.5, capsize=2)
-    axis.scatter(x, y, s=mark.size**2 / 2.5, color=colour, marker=_SYMBOLS[mark.symbol], label=None if mark.labelled else label, linewidths=0.8)
+    edge, named = (LIGHT["surface"], None) if mark.labelled else (None, label)
+    axis.scatter(x, y, s=mark.size**2 / 2.5, color=colour, marker=_SYMBOLS[mark.symbol], label=named, linewidths=0.8, edgecolors=edge)
     if mark.labelled:
+        from matplotlib.patheffects import withStroke
+
+        around = [withStroke(linewidth=2.2, foreground=LIGHT["surface"])]  # so that it can be read on any colour of a map
         for place in zip(x, y, strict=True):
-            axis.annotate(label, place, xytext=(0, 6), textcoords="offset points", ha="center", fontsize=7, color=colour)
+            axis.annotate(label, place, xytext=(0, 6), textcoords="offset points", ha="center", fontsize=7, color=LIGHT["ink"], path_effects=around)
 
 
 def _bars(axis: "Axes", mark: Bars, label: str, number: int, count: int, categories: list[str], base: Any) -> None:
@@ -132,7 +171,11 @@ def _bars(axis: "Axes", mark: Bars, label: str, number: int, count: int, categor
 def _name_categories(axis: "Axes", categories: list[str]) -> None:
     steep = len(categories) > 4 or max((len(name) for name in categories), default=0) > 14
     axis.set_xticks(
-        range(len(categories)), [_plain(name) for name in categories], rotation=35 if steep else 0, ha="right" if steep else "center", fontsize=8
+        range(len(categories)),
+        [_plain(shortened(name, MOST_ROW_LETTERS)) for name in categories],
+        rotation=35 if steep else 0,
+        ha="right" if steep else "center",
+        fontsize=8,
     )
 
 

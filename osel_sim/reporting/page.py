@@ -13,6 +13,8 @@ from osel_sim.reporting.description import DARK, LIGHT, Figure, Table
 from osel_sim.reporting.tables import to_csv, to_text
 
 PAGE, FIGURES, TABLES = "report.html", "figures", "tables"
+ROW_HEIGHT = 22
+"""Pixels of a row of a panel that has named rows."""
 
 Block = str | Figure | Table
 
@@ -131,6 +133,7 @@ def to_html(page: Page) -> str:
     return environment.from_string((template / "report.html.j2").read_text(encoding="utf-8")).render(
         page=page,
         text=to_text,
+        row_height=ROW_HEIGHT,
         light=LIGHT,
         dark=DARK,
         css=Markup((template / "report.css").read_text(encoding="utf-8")),

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from osel_sim.reporting.description import Bars, Figure, Heat, Line, Mark, Panel, Points
+from osel_sim.reporting.description import MOST_ROW_LETTERS, Bars, Figure, Heat, Line, Mark, Panel, Points, shortened
 
 _SCALES: dict[str, list[list[float | str]]] = {
     "sequential": [[0.0, "@surface"], [1.0, "@c0"]],
@@ -15,9 +15,19 @@ _SCALES: dict[str, list[list[float | str]]] = {
 }
 
 
+_NARROW = 20
+"""Letters of the name of a row where there is little room, as on a phone; a touch on a point shows all of it."""
+
+
 def to_plotly(figure: Figure) -> dict[str, Any]:
-    """`{name, panels: [{data, layout}]}`, plain data for JSON."""
-    return {"name": figure.name, "panels": [{"data": _traces(panel), "layout": _layout(panel)} for panel in figure.panels]}
+    """`{name, panels: [{data, layout, narrow}]}`, plain data for JSON; `narrow`: names of the rows where there is little room."""
+    return {
+        "name": figure.name,
+        "panels": [
+            {"data": _traces(panel), "layout": _layout(panel), "narrow": [escaped(shortened(name, _NARROW)) for name in panel.rows]}
+            for panel in figure.panels
+        ],
+    }
 
 
 def numbers(values: ArrayLike) -> list[float | None]:
@@ -138,7 +148,7 @@ def _points(mark: Points, name: str) -> dict[str, Any]:
             "color": f"@{mark.colour}",
             "size": mark.size,
             "symbol": mark.symbol,
-            "line": {"width": 0.6 if mark.size > 6 else 0, "color": "@surface"},
+            "line": {"width": 1.2 if mark.labelled else 0.6 if mark.size > 6 else 0, "color": "@surface"},
         },
         "legendgroup": name,
         "visible": True if mark.shown else "legendonly",
@@ -147,7 +157,13 @@ def _points(mark: Points, name: str) -> dict[str, Any]:
     if mark.texts is not None:
         trace |= {"hovertext": [escaped(text) for text in mark.texts], "hovertemplate": "%{hovertext}"}
     if mark.labelled:
-        trace |= {"text": [name] * len(trace["x"]), "textposition": "top center", "textfont": {"color": f"@{mark.colour}"}, "showlegend": False}
+        trace |= {
+            "text": [name] * len(trace["x"]),
+            "textposition": "top center",
+            "textfont": {"color": "@ink"},
+            "showlegend": False,
+            "cliponaxis": False,
+        }
     if mark.x_interval is not None:
         trace["error_x"] = _errors(mark.x, mark.x_interval) | {"color": f"@{mark.colour}/0.5"}
     if mark.y_interval is not None:
@@ -189,6 +205,12 @@ def _layout(panel: Panel) -> dict[str, Any]:
     if panel.bare:
         for name in ("xaxis", "yaxis"):
             layout[name] |= {"showticklabels": False, "showgrid": False, "zeroline": False}
+    if panel.rows:
+        names = [escaped(shortened(name, MOST_ROW_LETTERS)) for name in panel.rows]
+        rows = {"tickmode": "array", "tickvals": list(range(len(names))), "ticktext": names, "range": [len(names) - 0.5, -0.5], "zeroline": False}
+        layout["yaxis"] |= rows | {"tickfont": {"color": "@ink", "size": 11}}
+        # On top: that is where one begins to read, and the other end may be out of sight.
+        layout["xaxis"] |= {"side": "top", "nticks": 8}
     if panel.y_range is not None:
         low, high = np.log10(panel.y_range) if panel.y_log else panel.y_range
         layout["yaxis"]["range"] = [float(low), float(high)]

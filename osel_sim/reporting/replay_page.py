@@ -11,6 +11,7 @@ from osel_sim.errors import DataError, UsageError
 from osel_sim.formats.replay_result import REPLAY, Choices, read_replay
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.offline.clusters import score_of
+from osel_sim.offline.frontier import measured
 from osel_sim.offline.live import is_live_run, read_live
 from osel_sim.offline.log import Array, LoggedOutcomes, read_log
 from osel_sim.offline.measures import curves
@@ -71,9 +72,9 @@ def _page(folder: Path, result: Mapping[str, Any], choices: Choices, options: Re
     streams = _streams(log, weights, choices, names)
     always = {shown: name.removeprefix("fixed:") for name, shown in names.items() if name.startswith("fixed:")}
     stake = result["verdict"]["stake"]
-    style = style_of(list(streams), log.policies, always, {*_ends(result, names), names.get(str(stake.get("selector")), "")})
-    learners = {shown: streams[shown] for name, shown in names.items() if not name.startswith("fixed:")}
     learnable = ORACLES[result["learnable_oracle"]["name"]]
+    style = style_of(list(streams), log.policies, always, {*_ends(result, names), names.get(str(stake.get("selector")), "")}, learnable)
+    learners = {shown: streams[shown] for name, shown in names.items() if not name.startswith("fixed:")}
     selectors: list[Block] = [curve_figure(streams, style), selector_table(result, names)]
     gap = gap_figure({names[name]: gaps(entry) for name, entry in result["selectors"].items() if entry["kind"] == "learner"}, learnable)
     regret = regret_figure(streams, [*_ends(result, names)[:1], *(word for word in ORACLES.values() if word in streams)], style)
@@ -81,7 +82,7 @@ def _page(folder: Path, result: Mapping[str, Any], choices: Choices, options: Re
     selectors += [block for block in (gap, regret, penalty_figure(streams, weights, style), shares) if block is not None]
     selectors += [oracle_table(result), *paired_tables(result, names)]
     selectors += [off_policy_table(result["off_policy"])] if result.get("off_policy") else []
-    points = {shown: _point(streams[shown]) for name, shown in names.items() if not name.startswith("fixed:")}
+    points = _points(log, weights, choices, {name: shown for name, shown in names.items() if not name.startswith("fixed:")})
     replayed = Replayed(points, result.get("frontier"), style.colour, style.shown)
     shared, _ = log_sections(log, weights, replayed)
     title = f"{few(result['log']['tasks'])}: {len(learners)} selectors over {choices.order.shape[1]:,} decisions, {len(choices.order)} seeds"
@@ -147,10 +148,14 @@ def _streams(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, name
     return streams
 
 
-def _point(stream: Stream) -> dict[str, float]:
-    """Score, seconds and price over the last quarter of the stream: what it comes to once it has learnt."""
-    late = slice(stream.reward.shape[1] * 3 // 4, None)
-    return {name: float(np.nanmean(values)) for name in ("score", "seconds", "price") if np.isfinite(values := getattr(stream, name)[:, late]).any()}
+def _points(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str]) -> dict[str, dict[str, float]]:
+    """What each selector came to over the last quarter of its streams, once it has learnt."""
+    late = slice(choices.order.shape[1] * 3 // 4, None)
+    found: dict[str, dict[str, float]] = {}
+    for name, shown in names.items():
+        received = {key: choices.received(name, table)[:, late] for key, table in measured(log, weights).items()}
+        found[shown] = {key: float(np.nanmean(values)) for key, values in received.items() if np.isfinite(values).any()}
+    return found
 
 
 def _verdict(result: Mapping[str, Any]) -> Verdict:
@@ -167,7 +172,8 @@ def _verdict(result: Mapping[str, Any]) -> Verdict:
         tiles.append(Tile(f"{stake['selector']} over it", signed(gain), f"reward a decision, bounds {bounds(*stake['gain_bounds'])}"))
         tiles.append(Tile("in the last quarter", signed(late), f"reward a decision, bounds {bounds(*stake['gain_late_bounds'])}"))
     learnable = ORACLES[stake["learnable_oracle"]]
-    tiles.append(Tile("learnable gain", signed(stake["learnable_gain"]), f"reward a decision: {learnable}"))
+    gain = signed(stake["learnable_gain"]) if stake["learnable_gain"] > 0.0 else "none seen"
+    tiles.append(Tile("learnable gain", gain, f"reward a decision: {learnable}"))
     return Verdict(headline, [text[:1].upper() + text[1:]], tiles, "good" if route else "neutral")
 
 

@@ -32,6 +32,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
     """
     rows: list[dict[str, Cell]] = []
     predictable = result["learnable_oracle"]["name"] == "predictable"
+    also = _measures(result["reward"])
     shown = sorted(names, key=lambda name: -float(result["selectors"][name]["mean_reward"]))
     for name in shown:
         entry = result["selectors"][name]
@@ -41,7 +42,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
                 "selector": names[name],
                 "reward": _estimate(entry, "mean_reward", "ci95"),
                 "success": _estimate(entry, "success_rate", "success_ci95"),
-                **{key: entry[key] for key in ("mean_seconds", "mean_price")},
+                **{key: entry.get(key) for key in also},
                 "gap": gaps(entry)[0] if learns else None,
                 "gap_late": gaps(entry)[1] if learns else None,
                 **({} if predictable else {"predictable_late": _estimate(entry, "predictable_gap_closed_late") if learns else None}),
@@ -51,7 +52,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
         )
     columns = [
         *(Column("selector", "selector", "text"), Column("reward", "mean reward", digits=3), Column("success", "success", "percent")),
-        *(Column("mean_seconds", "seconds"), Column("mean_price", "price (cents)", digits=1)),
+        *(Column(key, heading, digits=digits) for key, (heading, digits) in also.items()),
         *(Column("gap", "gap closed", "percent"), Column("gap_late", "last quarter", "percent")),
         *([] if predictable else [Column("predictable_late", "of the predictable", "percent")]),
         *(Column(f"regret_{oracle}", f"regret to {word}", digits=3) for oracle, word in ORACLES.items() if oracle in result["oracles"]),
@@ -66,6 +67,13 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
     if any(name.endswith(":warm") for name in names):
         caption += " A selector named :warm was shown the outcomes of the log's other half before its first decision."
     return Table("selectors", "What each selector came to", caption, columns, rows)
+
+
+def _measures(reward: Mapping[str, Any]) -> dict[str, tuple[str, int | None]]:
+    """Which means a table of selectors shows besides reward and success, with their headings and digits: what the reward is made of."""
+    graded = {"subgoals": {"mean_subgoals": ("subgoals", 2)}, "score": {"mean_score": ("score", 4)}}.get(reward["success"], {})
+    time = {"mean_steps": ("steps", 0)} if reward["time_unit"] == "steps" else {"mean_seconds": ("seconds", 2)}
+    return {**graded, **time, "mean_price": ("price (cents)", None)}
 
 
 def oracle_table(result: Mapping[str, Any]) -> Table:

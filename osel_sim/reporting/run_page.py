@@ -24,6 +24,7 @@ from osel_sim.reporting.log_sections import formula
 from osel_sim.reporting.off_policy_section import off_policy_table
 from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
 from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, penalty_figure, regret_figure, share_figure, style_of
+from osel_sim.reporting.tables import to_text
 from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
 
 VIDEOS = "videos"
@@ -143,7 +144,7 @@ def _chosen_table(run: _Run, selector: str) -> Table:
     columns = [
         *(Column("who", "", "text"), Column("decisions", "decisions"), Column("errors", "errors"), Column("fallbacks", "fallbacks")),
         *(Column("success", "success", "percent"), Column("reward", "mean reward", digits=3)),
-        *(Column("steps", "steps", digits=0), Column("seconds", "seconds"), Column("price", "price (cents)", digits=1)),
+        *(Column("steps", "steps", digits=0), Column("seconds", "seconds"), Column("price", "price (cents)", digits=None)),
     ]
     caption = "What was received, with 95% intervals; errors are no failures and count nowhere else."
     return Table("chosen", "What the selector received", caption, columns, rows)
@@ -194,7 +195,7 @@ def _mean_tiles(stream: Stream) -> list[Tile]:
 
     seconds, price = mean(stream.seconds), mean(stream.price)
     tiles = [Tile("seconds an episode", f"{seconds:.1f}")] if seconds is not None and seconds >= FLOOR_SECONDS else []
-    return tiles + ([Tile("cents an episode", f"{price:.1f}")] if price is not None else [])
+    return tiles + ([Tile("cents an episode", to_text(price, Column("", "", digits=None)))] if price is not None else [])
 
 
 def _facts(run: _Run) -> list[tuple[str, str]]:

@@ -52,20 +52,23 @@ class Stream:
     chosen: NDArray[np.int64] | None = None
 
 
-def style_of(names: Sequence[str], policies: Sequence[str], always: Mapping[str, str], keep: Collection[str] = ()) -> Style:
-    """Colours: a fixed policy has its policy's, oracles are ink, all others have one of their own.
+def style_of(names: Sequence[str], policies: Sequence[str], always: Mapping[str, str], keep: Collection[str] = (), learnable: str = "") -> Style:
+    """Colours: a fixed policy has its policy's, hindsight and learnable oracle are ink, other oracles muted, all others have one of their own.
 
     Args:
         always: name of a fixed policy -> the policy.
-        keep: shown in any case; of few names all are, of many the main ones and the hindsight oracle.
+        keep: shown in any case; of few names all are, of many the main ones; of the oracles the hindsight and the learnable one.
+        learnable: name of that oracle.
     """
-    oracles = set(ORACLES.values())
+    oracles, bounds = set(ORACLES.values()), {ORACLES["hindsight"], learnable}
     of_policy = colours(policies)
-    shown = names if len(names) <= _FEW else [name for name in names if name in MAIN or name in keep or name == ORACLES["hindsight"]]
+    shown = [name for name in names if name in bounds or (name not in oracles and (len(names) <= _FEW or name in MAIN or name in keep))]
     # Those shown first: colours repeat, and two that are seen together must not share one.
     others = sorted((name for name in names if name not in always and name not in oracles), key=lambda name: name not in shown)
     own = colours([*policies, *others])
-    colour = {name: "ink" if name in oracles else of_policy[always[name]] if name in always else own[name] for name in names}
+    colour = (
+        {name: own.get(name, "muted") for name in names} | {name: of_policy[policy] for name, policy in always.items()} | dict.fromkeys(bounds, "ink")
+    )
     return Style(colour, frozenset(shown))
 
 
@@ -200,7 +203,7 @@ def _lines(values: Mapping[str, Array], style: Style) -> list[Mark]:
         half = _NORMAL * part.std(axis=0, ddof=1) / np.sqrt(len(part)) if len(part) > 1 else None
         low, high = (None, None) if half is None else (mean - half, mean + half)
         wide = 2.6 if name in ("auto", "ppo") else 1.7
-        dash = name in ORACLES.values()
+        dash = name in (ORACLES["hindsight"], ORACLES["predictable"]) and (name == ORACLES["hindsight"] or style.colour[name] == "muted")
         marks.append(Line(name, at + 1, mean, style.colour[name], low, high, dash, wide, shown=name in style.shown))
     return marks
 

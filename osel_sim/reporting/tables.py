@@ -5,7 +5,7 @@ import io
 import math
 
 from osel_sim.offline.estimate import Estimate
-from osel_sim.reporting.description import Cell, Column, Table
+from osel_sim.reporting.description import Cell, Column, Table, digits_of
 
 
 def to_csv(table: Table) -> str:
@@ -35,7 +35,8 @@ def to_text(cell: Cell, column: Column) -> str:
         return str(cell)
     if column.style == "percent":
         return f"{100 * cell:.0f}%".replace("-", "\u2212")
-    return (f"{cell:,}" if isinstance(cell, int) else f"{cell:,.{column.digits}f}").replace("-", "\u2212")
+    digits = digits_of([cell]) if column.digits is None else column.digits  # a column of a table knows its digits
+    return (f"{cell:,}" if isinstance(cell, int) else f"{cell:,.{digits}f}").replace("-", "\u2212")
 
 
 def _headings(key: str, wide: bool) -> list[str]:

@@ -40,7 +40,7 @@ def print_rollouts(console: Console, rows: Sequence[Row], weights: RewardWeights
 def share_best(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeights) -> dict[str, float]:
     """Share of the instances on which each policy has the highest mean reward over its repeats (the first, where several share it).
 
-    Only instances on which every policy has a valid outcome count; the share is 0 for all where there are none.
+    Only instances on which every policy has a valid outcome count; empty where there are none, such as where prices are not known.
     """
     rewards: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     for row in rows:
@@ -49,7 +49,7 @@ def share_best(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeig
             rewards[row.instance][row.policy].append(value)
     complete = [found for found in rewards.values() if all(policy in found for policy in policies)]
     best = [max(policies, key=lambda policy: float(np.mean(found[policy]))) for found in complete]
-    return {policy: best.count(policy) / len(best) if best else 0.0 for policy in policies}
+    return {policy: best.count(policy) / len(best) for policy in policies if best}
 
 
 def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeights) -> Table:
@@ -75,7 +75,7 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
             *measured,
             *([number(_mean([logged_seconds(row) for row in valid]))] if timed else []),
             number(_mean([logged_reward(row, weights) for row in valid]), 3),
-            f"{100 * best[policy]:.0f}%",
+            percent(best.get(policy)),
             str(sum(row.fallback is not None for row in own)),
             str(len(own) - len(valid)),
         )

@@ -36,6 +36,7 @@
       panel.layout.dragmode = touch ? false : "zoom";
       if (touch) { panel.layout.xaxis.fixedrange = true; panel.layout.yaxis.fixedrange = true; }
       panel.layout.showlegend = false;
+      if (panel.narrow.length && plot.clientWidth < 480) panel.layout.yaxis.ticktext = panel.narrow;
       return Plotly.react(plot, panel.data, panel.layout, config);
     });
     return Promise.all(work);
@@ -141,7 +142,8 @@
     const targets = distinct(book.instances.map((item) => item.target));
     options(controls.target, "anything", targets, targets.map(plain));
     options(controls.policy, "all policies", book.policies);
-    options(controls.outcome, "any outcome", ["success", "failure", "fallback", ...(all.some((episode) => episode.error) ? ["error"] : [])], ["success", "not done", "fell back to the local policy", "error"]);
+    const outcomes = [["success", "success"], ["failure", "not done"], ["fallback", "fell back to the local policy"], ["error", "error"]].filter(([kind]) => all.some((episode) => ended(episode, kind)));
+    options(controls.outcome, "any outcome", outcomes.map((kind) => kind[0]), outcomes.map((kind) => kind[1]));
     const kinds = [["chosen", "what was chosen"], ["differ", "where policies differ"], ["pictures", "with pictures"]].filter(([kind]) => all.some((episode) => shown(episode, kind)));
     options(controls.kind, "all episodes", kinds.map((kind) => kind[0]), kinds.map((kind) => kind[1]));
     controls.kind.closest("label").hidden = kinds.length === 0;
@@ -154,16 +156,25 @@
       return true;
     }
 
+    function ended(episode, kind) {
+      return kind === "fallback" ? Boolean(episode.fallback) : outcome(episode)[0] === kind;
+    }
+
     function fits(episode) {
       const wanted = controls.outcome.value;
       return (!controls.task.value || episode.about.task === controls.task.value)
         && (!controls.target.value || episode.about.target === controls.target.value)
         && (!controls.policy.value || episode.policyName === controls.policy.value)
-        && (!wanted || (wanted === "fallback" ? Boolean(episode.fallback) : outcome(episode)[0] === wanted))
+        && (!wanted || ended(episode, wanted))
         && shown(episode, controls.kind.value)
         && (episode.about.instruction || "").toLowerCase().includes(controls.text.value.trim().toLowerCase());
     }
 
+    // Outcomes with a grade, where the log has them.
+    const GRADED = [
+      ["subgoals", (value) => (value === null ? "–" : `${Math.round(100 * value)}%`)],
+      ["score", (value) => fixed(value, book.digits.score)],
+    ].filter(([name]) => name in book.episodes);
     const list = document.getElementById("episode-list");
     const more = document.getElementById("episode-more");
     let found = [];
@@ -179,8 +190,8 @@
       result.append(chip(episode));
       button.append(result,
         element("span", "right wide-only", fixed(episode.reward, 2)),
-        element("span", "right wide-only", fixed(episode.seconds, 1)),
-        element("span", "right wide-only", fixed(episode.price, 1)));
+        element("span", "right wide-only", fixed(episode.seconds, book.digits.seconds)),
+        element("span", "right wide-only", fixed(episode.price, book.digits.price)));
       button.addEventListener("click", () => open(episode));
       return button;
     }
@@ -195,7 +206,9 @@
       found = all.filter(fits);
       const head = element("div", "episode head");
       ["#", "instruction", "policy", "outcome", "reward", "seconds", "cents"].forEach((name, place) => head.append(element("span", place > 3 ? "right" : "", name)));
-      list.replaceChildren(head);
+      const none = element("p", "", "No episode fits.");
+      none.id = "episode-none";
+      list.replaceChildren(...(found.length ? [head] : [none]));
       document.getElementById("episode-count").textContent = `${found.length.toLocaleString("en")} of ${all.length.toLocaleString("en")} episodes`;
       extend(PAGE);
     }
@@ -203,15 +216,17 @@
     function comparison(episode) {
       const table = element("table");
       const head = table.createTHead().insertRow();
-      ["policy", "outcome", "reward", "steps", "seconds", "where the time went", "cents"].forEach((name) => head.append(element("th", "", name)));
+      ["policy", "outcome", ...GRADED.map(([name]) => name), "reward", "steps", "seconds", "where the time went", "cents"].forEach((name) => head.append(element("th", "", name)));
       const body = table.createTBody();
       for (const other of all.filter((item) => item.instance === episode.instance)) {
         const line = body.insertRow();
-        line.insertCell().textContent = other.policyName + (other.chosen === 1 ? " (chosen)" : "") + (other.repeat > 0 ? `, repeat ${other.repeat}` : "");
+        const name = other.policyName + (other.chosen === 1 ? " (chosen)" : "") + (other.repeat > 0 ? `, repeat ${other.repeat}` : "");
+        line.insertCell().append(element("div", "name", name));
         line.insertCell().append(chip(other));
-        [[other.reward, 3], [other.steps, 0], [other.seconds, 2]].forEach(([value, digits]) => { line.insertCell().textContent = fixed(value, digits); });
+        GRADED.forEach(([name, shown]) => { line.insertCell().textContent = shown(other[name]); });
+        [[other.reward, 3], [other.steps, 0], [other.seconds, book.digits.seconds]].forEach(([value, digits]) => { line.insertCell().textContent = fixed(value, digits); });
         line.insertCell().append(phases(other));
-        line.insertCell().textContent = fixed(other.price, 1);
+        line.insertCell().textContent = fixed(other.price, book.digits.price);
         if (other === episode) line.style.fontWeight = "650";
       }
       const holder = element("div", "wide");
@@ -238,8 +253,9 @@
     function summary(episode) {
       const line = element("p", "summary");
       line.append(element("strong", "", episode.policyName), " ", chip(episode));
-      const parts = [["reward", episode.reward, 3, ""], ["", episode.steps, 0, " steps"], ["", episode.seconds, 1, " s"], ["", episode.price, 1, " cents"]];
-      line.append(" ", parts.filter(([, value]) => value !== null).map(([name, value, digits, unit]) => `${name} ${fixed(value, digits)}${unit}`.trim()).join(" · "));
+      const parts = [["reward", episode.reward, 3, ""], ["", episode.steps, 0, " steps"], ["", episode.seconds, book.digits.seconds, " s"], ["", episode.price, book.digits.price, " cents"]];
+      const graded = GRADED.filter(([name]) => episode[name] !== null).map(([name, shown]) => `${name} ${shown(episode[name])}`);
+      line.append(" ", [...graded, ...parts.filter(([, value]) => value !== null).map(([name, value, digits, unit]) => `${name} ${fixed(value, digits)}${unit}`.trim())].join(" · "));
       return line;
     }
 
@@ -250,11 +266,13 @@
       if (!known.length) return [];
       const table = element("table");
       const head = table.createTHead().insertRow();
-      ["chosen by, over all seeds", ...book.policies].forEach((name) => head.append(element("th", "", name)));
+      const first = element("th");
+      first.append(element("div", "name", "chosen by, over all seeds"));
+      head.append(first, ...book.policies.map((name) => element("th", "", name)));
       const body = table.createTBody();
       for (const name of known) {
         const line = body.insertRow();
-        line.insertCell().textContent = name;
+        line.insertCell().append(element("div", "name", name));
         book.picks[name][episode.instance].forEach((share) => { line.insertCell().textContent = `${Math.round(100 * share)}%`; });
       }
       const holder = element("div", "wide spaced");
@@ -288,6 +306,8 @@
           strip.append(image);
         });
         body.append(strip);
+      } else if (about.drawable && !video) {
+        body.append(element("p", "caption", "No picture of it here: python -m osel_sim.report with --scenes N draws how N instances begin, again from their seeds."));
       }
       if (episode.error) body.append(element("p", "", `Ended in error: ${episode.error}`));
       if (episode.fallback) body.append(element("p", "", `Fell back to the local policy: ${episode.fallback}`));

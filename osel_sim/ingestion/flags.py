@@ -1,0 +1,74 @@
+"""The command line's flags as what a mapping file would hold; what is wrong with it names the flag."""
+
+import argparse
+from typing import Any
+
+from osel_sim import cli
+from osel_sim.errors import ContentError, UsageError
+from osel_sim.formats.validate import Table
+from osel_sim.ingestion.mapping import COMMAND_LINE, VALUES, flag
+
+
+class FlagTable(Table):
+    """A mapping's table that was made of flags: errors name the flag where those of a file name the key."""
+
+    def error(self, key: str, problem: str) -> ContentError:
+        """An error about one flag, to be raised."""
+        return ContentError(self.file, flag(self.prefix + key), problem)
+
+    def table(self, key: str, default: Any = ...) -> Table:
+        """A table within this one."""
+        part = super().table(key, default)
+        return FlagTable(part.data, part.file, part.prefix)
+
+
+def as_table(options: argparse.Namespace, files: tuple[str, ...]) -> FlagTable:
+    """A mapping's table.
+
+    Args:
+        options: the flags of `osel_sim.ingest`.
+        files: the tables' names or patterns, relative to the working folder.
+
+    Raises:
+        UsageError: a policy is named twice or not at all, or a value is given twice or for an unknown policy.
+    """
+    names = options.policies or []
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"policy {name!r} is named twice after --policies")
+    if not names and options.policy_column is None:
+        raise UsageError("--policies or --policy-column is missing: a wide table needs the policies' names, a long one its column of them")
+    instance = {"text": options.text, "images": options.image, "group": options.group, "key": options.key, "duplicates": options.duplicates}
+    outcome: dict[str, Any] = {"policy": options.policy_column, "repeat": options.repeat_column}
+    policies: dict[str, dict[str, Any]] = {name: {} for name in names}
+    for key in VALUES:
+        for item in getattr(options, key) or []:
+            policy, equals, value = item.partition("=")
+            if equals and policy in policies:
+                policies[policy][key] = _value(key, value, options.at_least)
+            elif equals and names:
+                raise UsageError(f"--{key} {item}: unknown policy {policy!r}: {cli.did_you_mean(policy, names)}known: {', '.join(names)}")
+            elif key in outcome:
+                raise UsageError(f"--{key}: {item!r} is the second value for all policies; write POLICY=VALUE, with the policies after --policies")
+            else:
+                outcome[key] = _value(key, item, options.at_least)
+    data = {
+        "version": 1,
+        "name": options.name or options.out.resolve().name,
+        "table": {"files": list(files)},
+        "instance": {key: value for key, value in instance.items() if value is not None},
+        "outcome": {key: value for key, value in outcome.items() if value is not None},
+        "policies": policies,
+    }
+    return FlagTable(data, COMMAND_LINE)
+
+
+def _value(key: str, text: str, at_least: float | None) -> Any:
+    if key == "success":
+        return text if at_least is None else {"column": text, "at_least": at_least}
+    if key == "error":
+        return text
+    try:
+        return text if "_" in text else float(text)  # Python takes 1_000 for a number; here it is the name of a column
+    except ValueError:
+        return text
