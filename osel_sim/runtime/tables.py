@@ -9,7 +9,7 @@ from rich.table import Table
 
 def console() -> Console:
     """Standard output; wide enough for a table where it is no terminal."""
-    return Console(file=sys.stdout, width=None if sys.stdout.isatty() else 140, highlight=False)
+    return Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False)
 
 
 def number(value: float | None, digits: int = 2) -> str:
