@@ -1,11 +1,11 @@
 """How much quicker than SB3's own loop: PPO with the paper's settings over a logged stream.
 
-    python benchmarks/replay.py [--dim 256] [--decisions 1000] [--seeds 4] [--workers 2]
+    python benchmarks/replay.py [--dim 256] [--decisions 1000] [--seeds 20] [--sb3-seeds 2] [--workers 2]
 
 Both sides make the same decisions on the same contexts and rewards in one run. First one seed after another in this process, one thread each, SB3's
-`learn()` and ours in turn, less the time of five decisions, which is that of making the networks; then ours once more for all seeds in `--workers`
-processes, starting them included, as `python -m osel_sim.replay` does it (on an idle machine; 1 leaves this out). What 20 seeds of 4,000 decisions
-would take is extrapolated from the time a decision.
+`learn()` and ours in turn for the first few seeds, less the time of five decisions, which is that of making the networks; then ours for all seeds in
+`--workers` processes, starting them included, as `python -m osel_sim.replay` does it (on an idle machine; 1 leaves this out). What 20 seeds of 4,000
+decisions would take is extrapolated from the time a decision.
 The last line is JSON: ratio (one SB3 loop to our processes), ratio_one_thread, decisions a second of each.
 """
 
@@ -31,7 +31,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--dim", type=int, default=256, help="length of a context (default: %(default)s, osel_small's)")
     parser.add_argument("--decisions", type=int, default=1000, help="of a stream (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=4, help="streams (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=20, help="streams of our processes (default: %(default)s)")
+    parser.add_argument("--sb3-seeds", type=int, default=2, help="the first so many of them one after another, with SB3 (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes of our side (default: %(default)s)")
     options = parser.parse_args()
 
@@ -40,22 +41,25 @@ def main() -> None:
     sb3(contexts[:10], rewards[:10], 0)
     theirs = ours = 0.0
     with _one_thread():
-        for seed in range(options.seeds):
+        for seed in range(options.sb3_seeds):
             theirs += timed(partial(sb3, contexts, rewards, seed)) - timed(partial(sb3, contexts[:5], rewards[:5], seed))
             ours += timed(partial(replay_one, "ppo", contexts, rewards, POLICIES, seed))
             ours -= timed(partial(replay_one, "ppo", contexts[:5], rewards[:5], POLICIES, seed))
-    together = in_processes(options) if options.workers > 1 else ours
-    made = options.seeds * options.decisions
-    print(f"contexts of {options.dim} numbers, {options.decisions} decisions, {options.seeds} seeds")
-    for name, seconds in (("SB3's learn(), one thread", theirs), ("ours, one thread", ours), (f"ours, {options.workers} processes", together)):
-        minutes = 20 * 4000 * seconds / made / 60
-        print(f"{name:26} {seconds:7.1f} s, {made / seconds:7.1f} decisions/s; 20 seeds of 4,000 decisions: {minutes:.1f} min")
+    few, all_seeds = options.sb3_seeds * options.decisions, options.seeds * options.decisions
+    together = in_processes(options) / all_seeds if options.workers > 1 else ours / few
+    print(f"contexts of {options.dim} numbers, {options.decisions} decisions, {options.seeds} seeds, {options.sb3_seeds} of them one after another")
+    for name, each in (
+        ("SB3's learn(), one thread", theirs / few),
+        ("ours, one thread", ours / few),
+        (f"ours, {options.workers} processes", together),
+    ):
+        print(f"{name:26} {1 / each:7.1f} decisions/s; 20 seeds of 4,000 decisions: {20 * 4000 * each / 60:.1f} min")
     figures = {
-        "ratio": theirs / together,
+        "ratio": theirs / few / together,
         "ratio_one_thread": theirs / ours,
-        "sb3_decisions_per_second": made / theirs,
-        "one_thread_decisions_per_second": made / ours,
-        "decisions_per_second": made / together,
+        "sb3_decisions_per_second": few / theirs,
+        "one_thread_decisions_per_second": few / ours,
+        "decisions_per_second": 1 / together,
         "dim": options.dim,
         "workers": options.workers,
     }
