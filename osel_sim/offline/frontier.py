@@ -17,7 +17,7 @@ _POINTS = 49
 _REPLAYED = 6
 """Weights at which selectors are replayed: a replay takes seconds where an oracle takes none."""
 _DECISIONS = 1_000
-_SEEDS_FOR_EACH = 10
+_SEEDS_FOR_EACH = 20
 
 Chooser = Callable[[Array], NDArray[np.int64]]
 """Of rewards (N, P): the column chosen for each instance, (N,)."""
@@ -91,7 +91,7 @@ def selector_frontiers(
         log: complete instances only.
         setup: under what to replay at other weights.
         weights: in the middle.
-        seeds, decisions: of the replay that this goes with; a tenth of the seeds and 1,000 decisions at most are replayed at each weight.
+        seeds, decisions: of the replay that this goes with; one in twenty of the seeds and 1,000 decisions at most are replayed at each weight.
         progress: called with a number of decisions made, and that of all there will be.
 
     Returns:
