@@ -32,7 +32,7 @@ Instances on which some policy has no valid outcome are left out and counted. Th
 A log has no price lists: what policies cost, auto is told from the other half where --half is given, else from the log itself.
 With --half a selector that learns off-policy can be shown all outcomes of the other half before its stream begins: auto:warm, linucb:warm ...
 
-Once that is said and written, selectors are replayed at other weights of time and price too, for the frontier: about as long again.
+Once that is said and written, selectors are replayed at other weights of time and price too, for the frontier: about half as long again.
 
 Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv, frontier.csv. Of a live run's folder it estimates
 what each fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes."""
@@ -126,11 +126,12 @@ def _replay(
             file=sys.stderr,
         )
     setup = _setups(log, others, selectors, options)
-    told = setup(weights).settings.values()
+    here = setup(weights)
+    told = here.settings.values()
     best = oracles(log, weights)
     decisions = len(log) if options.decisions is None else options.decisions
     with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
-        (chosen,) = replay(log, [setup(weights)], selectors, range(options.seeds), options.decisions, options.workers, bar.update)
+        (chosen,) = replay(log, [here], selectors, range(options.seeds), options.decisions, options.workers, bar.update)
     choices = with_fixed(chosen, best)
     result = build(log, weights, preset, choices, best, left_out, range(options.seeds))
     result["log"]["half"] = options.half

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli, content
 from osel_sim.errors import OselError, UnknownNameError
-from osel_sim.reward_flags import DEFAULT_PRESET
+from osel_sim.reward_flags import add_reward_flags, weights_of
 
 if TYPE_CHECKING:
     from osel_sim.context.encoder import Encoder
@@ -68,10 +68,7 @@ def parser() -> cli.Parser:
     add("--action-noise", type=cli.non_negative_float, default=0.0, metavar="S", help=NOISE_HELP)
     add("--split", choices=SPLITS, default="test", help="which instances (default: %(default)s)")
     add("--encoder", metavar="NAME", help="osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
-    add("--preset", metavar="NAME", help=f"reward weights of the paper: mmlu, waymo, alfred, oxe (default: {DEFAULT_PRESET})")
-    add("--alpha-time", type=cli.non_negative_float, metavar="A", help="weight of time in the reward (default: the preset's)")
-    add("--alpha-price", type=cli.non_negative_float, metavar="A", help="weight of the price in cents (default: the preset's)")
-    add("--time-unit", choices=("log10-seconds", "steps"), help="of time in the reward (default: the preset's)")
+    add_reward_flags(result, live=True)
     add("--out", type=Path, metavar="DIR", help="where to write (default: runs/TASK-SELECTOR-sSEED)")
     add("--resume", action="store_true", help="go on with the run in --out")
     add("--video", type=cli.non_negative_int, default=0, metavar="K", help="film K decisions, spread evenly over the run (default: none)")
@@ -95,7 +92,7 @@ def _run(options: argparse.Namespace) -> int:
     tasks = content.select_tasks(options.task, options.tasks)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
-    weights = _weights(options)
+    weights = weights_of(options)[0]
     _check_selector(options.selector, [spec.name for spec in policies], warm=options.warm_start is not None)
     folder = (
         options.out
@@ -297,15 +294,6 @@ def _check_selector(name: str, policies: list[str], warm: bool) -> None:
         from osel_sim.offline.beforehand import check_can_start_warm
 
         check_can_start_warm(kind)
-
-
-def _weights(options: argparse.Namespace) -> "RewardWeights":
-    from dataclasses import replace
-
-    from osel_sim.selection.reward import preset
-
-    given = {"alpha_time": options.alpha_time, "alpha_price": options.alpha_price, "time_unit": options.time_unit}
-    return replace(preset(options.preset or DEFAULT_PRESET), **{key: value for key, value in given.items() if value is not None})
 
 
 def _title(tasks: "Sequence[TaskSpec]") -> str:

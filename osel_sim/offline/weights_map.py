@@ -139,7 +139,7 @@ def trivial_ranges(log: LoggedOutcomes, labels: NDArray[np.int64], weights: Rewa
     the end.
     """
     part = swept(log, weights)
-    means, paper = _means(log, labels, weights, part), _Paper(log.take(part.rows), labels[part.rows], weights, remote)
+    means, paper = _means(log, labels, weights, part), _Paper(log.take(part.rows), labels[part.rows], weights, remote, part.axes)
     ranges = []
     for axis, high in limits(log, labels, weights).items():
         looked = np.concatenate([[0.0], np.geomspace(high / 1_000, high, 350)])
@@ -173,13 +173,15 @@ class _Paper:
     """Equation 5 of the paper for every cluster at any weights: 1 - p_FS against p_FS - alpha_time tau - alpha_price p.
 
     Args:
-        log: instances that have everything. labels: (N,) their clusters.
+        log: instances that have everything. labels: (N,) their clusters. axes: weights that can be moved.
     """
 
-    def __init__(self, log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWeights, remote: NDArray[np.bool_]) -> None:
+    def __init__(
+        self, log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWeights, remote: NDArray[np.bool_], axes: Sequence[Axis]
+    ) -> None:
         self._members = [labels == number for number in np.unique(labels)]
         self._only_remote = np.array([rates_of("", log.success[rows], remote).only_remote.value for rows in self._members])
-        self._score, self._time, self._price = (table[:, remote] for table in _tables(log, weights, swept(log, weights)))
+        self._score, self._time, self._price = (table[:, remote] for table in _tables(log, weights, axes))
 
     def remote_best(self, weights: RewardWeights) -> NDArray[np.bool_]:
         """Which clusters (C,) the paper gives to the remote side; of several remote policies the one with the highest reward on each instance."""
@@ -188,11 +190,11 @@ class _Paper:
         return np.array([1.0 - rate < rate - merged[rows].mean() for rate, rows in zip(self._only_remote, self._members, strict=True)])
 
 
-def _tables(log: LoggedOutcomes, weights: RewardWeights, part: Swept) -> tuple[Array, Array, Array]:
+def _tables(log: LoggedOutcomes, weights: RewardWeights, axes: Sequence[Axis]) -> tuple[Array, Array, Array]:
     """Score, time and price of every policy on every instance, (N, P) each; 0 for what the log does not have."""
     nothing = np.zeros(log.success.shape[:2])
-    time = time_of(log, weights) if "alpha_time" in part.axes else nothing
-    price = mean_over_repeats(log.price) if "alpha_price" in part.axes else nothing
+    time = time_of(log, weights) if "alpha_time" in axes else nothing
+    price = mean_over_repeats(log.price) if "alpha_price" in axes else nothing
     return mean_over_repeats(score_of(log, weights)), time, price
 
 
@@ -200,7 +202,7 @@ def _means(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWeight
     numbers = np.unique(labels[part.rows])
     members = [part.rows & (labels == number) for number in numbers]
     shares = np.array([rows.sum() / part.rows.sum() for rows in members])
-    return _Means(shares, *(np.stack([table[rows].mean(axis=0) for rows in members]) for table in _tables(log, weights, part)))
+    return _Means(shares, *(np.stack([table[rows].mean(axis=0) for rows in members]) for table in _tables(log, weights, part.axes)))
 
 
 def _ends(means: _Means, weights: RewardWeights) -> tuple[float, float]:

@@ -136,9 +136,8 @@ def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routin
     if replayed.points:
         caption += " Selectors: the last quarter of their streams, a large dot at these weights."
     if replayed.swept:
-        caption += (
-            f" Their lines: replayed at other weights, in {replayed.swept['seeds']} streams of {replayed.swept['decisions']:,} decisions at each."
-        )
+        streams = f"{replayed.swept['seeds']} stream{'s' if replayed.swept['seeds'] > 1 else ''}"
+        caption += f" Their lines: replayed at other weights, {streams} of {replayed.swept['decisions']:,} decisions at each."
     return Figure("frontier", f"Frontier: {label.partition(' (')[0]} against time and price", caption, panels)
 
 

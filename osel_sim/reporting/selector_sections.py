@@ -203,7 +203,7 @@ def _lines(values: Mapping[str, Array], style: Style) -> list[Mark]:
         half = _NORMAL * part.std(axis=0, ddof=1) / np.sqrt(len(part)) if len(part) > 1 else None
         low, high = (None, None) if half is None else (mean - half, mean + half)
         wide = 2.6 if name in ("auto", "ppo") else 1.7
-        dash = name in (ORACLES["hindsight"], ORACLES["predictable"]) and (name == ORACLES["hindsight"] or style.colour[name] == "muted")
+        dash = name == ORACLES["hindsight"] or (name == ORACLES["predictable"] and style.colour[name] == "muted")
         marks.append(Line(name, at + 1, mean, style.colour[name], low, high, dash, wide, shown=name in style.shown))
     return marks
 
