@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from osel_sim import content
-from osel_sim.episode import Driver, Frame, Subscriber, run_episode
-from osel_sim.policy.call import LocalCaller
+from osel_sim.core import content
+from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
+from osel_sim.policy.local import LocalCaller
 from osel_sim.policy.registry import make_policy
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.instance import make_instance

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from osel_sim import cli
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 from osel_sim.ingestion.mapping import VALUES
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def _table(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
     from osel_sim.ingestion.convert import convert
-    from osel_sim.ingestion.tables import read_tables
+    from osel_sim.ingestion.readers import read_tables
     from osel_sim.ingestion.write import Instance, check_out, file_digest, load_image, write_log
 
     _refuse(options, ("frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
@@ -167,9 +167,9 @@ def _table(options: argparse.Namespace) -> int:
 def _action_mse(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
+    from osel_sim.episodes.drivers import choose_policies
     from osel_sim.ingestion.action_mse import Settings, measure, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
-    from osel_sim.runtime.drivers import choose_policies
 
     start = time.perf_counter()
     if not options.dataset:
@@ -211,8 +211,8 @@ def _mapping(options: argparse.Namespace) -> "Mapping":
 
 
 def _finish(folder: Path, rows: "list[Row]", metric: str, preset_name: str, encoder: str, start: float) -> int:
-    from osel_sim.runtime.rollout_tables import print_rollouts
-    from osel_sim.runtime.tables import console
+    from osel_sim.cli.console import console
+    from osel_sim.cli.rollout_tables import print_rollouts
     from osel_sim.selection.reward import preset
 
     print(f"{folder}: {len(rows)} rows, contexts of {encoder}, {time.perf_counter() - start:.0f} s")

@@ -6,8 +6,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from osel_sim import cli, content
-from osel_sim.errors import UsageError
+from osel_sim import cli
+from osel_sim.core import content
+from osel_sim.core.errors import UsageError
 
 EXAMPLES = """examples:
   python -m osel_sim.train --policy local_small --data data/pick_place --out runs/train/local_small
@@ -63,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if any(argument.partition("=")[0] == "--encoder" for argument in arguments):
-        from osel_sim.context import train as encoder_training
+        from osel_sim.training.encoder import train as encoder_training
 
         return encoder_training.main(arguments)
     return _train_policy(parser().parse_args(arguments))

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from osel_sim import content
-from osel_sim.errors import ContentError, UnknownNameError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import ContentError, UnknownNameError, UsageError
 from osel_sim.formats.policy_file import load_policy_file
 
 

@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from osel_sim import ingest
+from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
 from osel_sim.formats.rollout_log import read_rollouts
-from osel_sim.offline.log import read_log
 from osel_sim.selection.reward import RewardWeights, preset
 
 SUBJECTS = {"anatomy": "Which bone is part of the hand?", "astronomy": "Which planet is nearest to the sun?"}

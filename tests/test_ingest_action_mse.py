@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from synthetic_demonstrations import STEPS, write
 
-from osel_sim import content, ingest
+from osel_sim import ingest
 from osel_sim.context.cache import ContextCache
-from osel_sim.episode import Driver
-from osel_sim.errors import DataError
+from osel_sim.core import content
+from osel_sim.core.errors import DataError
+from osel_sim.episodes.loop import Driver
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.ingestion.action_mse import Settings, action_mse, measure_one, open_datasets
-from osel_sim.policy.call import LocalCaller
+from osel_sim.policy.local import LocalCaller
 
 EPISODES = 2
 

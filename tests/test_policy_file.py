@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from osel_sim.errors import ContentError
+from osel_sim.core.errors import ContentError
 from osel_sim.formats.policy_file import Price, Remote, load_policy_file
 
 GOOD = """

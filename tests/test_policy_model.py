@@ -14,14 +14,14 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_TOKENS, OBS_STATE
 
-from osel_sim import content
-from osel_sim.errors import CheckpointError
+from osel_sim.core import content
+from osel_sim.core.errors import CheckpointError
+from osel_sim.core.torch_settings import threads
 from osel_sim.formats.mapping import Mapping
 from osel_sim.policy.language_chunk import LanguageChunkConfig, LanguageChunkPolicy, make_language_chunk_pre_post_processors
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.processing import area_weights, rotation_columns
 from osel_sim.policy.text import PADDING, embed, tokenise
-from osel_sim.threads import threads
 from osel_sim.training.recipe import find_recipe, load_recipe
 
 SIZE = 32

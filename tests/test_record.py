@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
 
-from osel_sim import content, record
+from osel_sim import record
+from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
+from osel_sim.core import content
+from osel_sim.episodes.workers import Plan
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.formats.run_config import digest
 from osel_sim.formats.task_file import load_task_file
-from osel_sim.offline.log import read_log
-from osel_sim.runtime.workers import Plan
 
 INSTANCES, REPEATS = 5, 2
 SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)

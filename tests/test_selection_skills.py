@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from osel_sim import content
 from osel_sim.context.encoder import load_encoder
-from osel_sim.errors import ContentError, DataError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import ContentError, DataError, UsageError
+from osel_sim.episodes.declared_skills import EXAMPLES, declare, declared_skills
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.skills import UNKNOWN, Skills
 from osel_sim.sim.instance import make_instance
-from osel_sim.skills import EXAMPLES, declare, declared_skills
 
 DIM, KINDS = 16, 4
 CENTRES = np.eye(KINDS, DIM, dtype=np.float32)

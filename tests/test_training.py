@@ -17,8 +17,8 @@ import torch
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file
 
-from osel_sim import content
-from osel_sim.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
 from osel_sim.policy.language_chunk import LanguageChunkPolicy
 from osel_sim.train import main
 from osel_sim.training.batches import Batches, frames_of, statistics_of

@@ -12,8 +12,8 @@ import torch
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from safetensors.torch import load_file
 
-from osel_sim import content
-from osel_sim.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
 from osel_sim.policy import register
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.training.annotations import load_annotations

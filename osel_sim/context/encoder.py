@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.content import root
-from osel_sim.errors import CheckpointError, UnknownNameError, UsageError
-from osel_sim.hub import offline_if_unreachable
+from osel_sim.core.content import root
+from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.hub import offline_if_unreachable
 
 Context = NDArray[np.float32]
 Image = NDArray[np.uint8]

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.context.encoder import Context, Encoder, Image, OpenClipEncoder, digest, load_encoder
-from osel_sim.errors import CheckpointError, UnknownNameError, UsageError
-from osel_sim.hub import offline_if_unreachable
+from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.hub import offline_if_unreachable
 
 SENTENCE = "sentence:"
 TFIDF = "tfidf"

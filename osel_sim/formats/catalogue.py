@@ -24,7 +24,7 @@ def load_catalogue(file: Path | None = None) -> Catalogue:
         ContentError: naming the file, the key and what would be right.
     """
     if file is None:
-        from osel_sim import content
+        from osel_sim.core import content
 
         file = content.root() / "assets" / "objects" / "objects.toml"
     table = Table.load(file)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from osel_sim.errors import ContentError
+from osel_sim.core.errors import ContentError
 from osel_sim.formats.mapping import Mapping, read_mapping
 from osel_sim.formats.validate import Table
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import DataError, UsageError
+from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.run_config import read_json, write_json
 
 SCHEMA_VERSION = 1

@@ -14,8 +14,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from osel_sim import content
-from osel_sim.errors import DataError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.task_file import TaskSpec
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from osel_sim.errors import ContentError
+from osel_sim.core.errors import ContentError
 from osel_sim.formats.levels import AXES
 from osel_sim.formats.terms import KINDS, PREDICATES, SKILLS, Term, parse_term
 from osel_sim.formats.validate import Table

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from osel_sim.errors import ContentError
+from osel_sim.core.errors import ContentError
 
 
 class Table:

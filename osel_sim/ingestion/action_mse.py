@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from osel_sim import cli
 from osel_sim.context.encoder import Image
-from osel_sim.episode import Driver, episode_seed
-from osel_sim.errors import DataError, UsageError
+from osel_sim.core.errors import DataError, UsageError
+from osel_sim.episodes.loop import Driver, episode_seed
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.ingestion.write import Instance, file_digest
-from osel_sim.policy.base import ACTION_DIM, STATE_DIM, Observation
+from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
 
 IMAGES = "observation.images."
 STATE, ACTION = "observation.state", "action"
@@ -157,7 +157,7 @@ def measure(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Se
     """
     from tqdm import tqdm  # type: ignore[import-untyped]
 
-    from osel_sim.runtime.drivers import Drivers
+    from osel_sim.episodes.drivers import Drivers
 
     rows = []
     with Drivers(specs) as drivers:

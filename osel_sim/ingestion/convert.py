@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from osel_sim.errors import DataError, UnknownNameError
+from osel_sim.core.errors import DataError, UnknownNameError
 from osel_sim.formats.rollout_log import Row
 from osel_sim.ingestion.mapping import Mapping, PolicyColumns, Success, Term, fill, threshold
-from osel_sim.ingestion.tables import Record, number, text
+from osel_sim.ingestion.readers import Record, number, text
 
 _TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0")
 _WAITING = ("upload", "inference", "download")

@@ -4,7 +4,7 @@ import argparse
 from typing import Any
 
 from osel_sim import cli
-from osel_sim.errors import ContentError, UsageError
+from osel_sim.core.errors import ContentError, UsageError
 from osel_sim.formats.validate import Table
 from osel_sim.ingestion.mapping import COMMAND_LINE, VALUES, flag
 

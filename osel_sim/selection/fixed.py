@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from osel_sim.errors import UnknownNameError
-from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+from osel_sim.core.errors import UnknownNameError
+from osel_sim.selection.base import Choice, Context, SelectorBase, State
 
 
 class FixedSelector(SelectorBase):

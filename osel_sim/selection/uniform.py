@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+from osel_sim.selection.base import Choice, Context, SelectorBase, State
 
 
 class UniformSelector(SelectorBase):

@@ -4,8 +4,8 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from osel_sim import content
-from osel_sim.errors import UnknownNameError
+from osel_sim.core import content
+from osel_sim.core.errors import UnknownNameError
 from osel_sim.formats.validate import Table
 
 _CHUNK = {"chunk_size": (1, 200), "image_size": (16, 512)}
