@@ -11,9 +11,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
 from osel_sim import cli
-from osel_sim.core import content
 from osel_sim.core.errors import UsageError
 from osel_sim.core.processes import end_with_parent
+from osel_sim.formats import library
 from osel_sim.formats.levels import parse_axes, resolve
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.training.annotations import SIDE_FILE, read_json
@@ -45,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tasks", type=cli.folder, default=None, help="folder with task files of your own")
     options = parser.parse_args(arguments)
 
-    tasks = content.select_tasks(options.task, options.tasks)
+    tasks = library.select_tasks(options.task, options.tasks)
     axes = parse_axes(options.axis)
     outs = [options.out] if len(tasks) == 1 else [options.out / task.name for task in tasks]
     for task, out in zip(tasks, outs, strict=True):

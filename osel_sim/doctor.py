@@ -75,7 +75,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _examine_policy(options: argparse.Namespace) -> int:
-    from osel_sim.episodes.policy_check import check_policy, find_policy, print_report
+    from osel_sim.cli.policy_report import print_report
+    from osel_sim.episodes.policy_check import check_policy, find_policy
 
     spec, folder = find_policy(options.policy, options.policies_dir)
     out = options.out or Path("runs") / "doctor" / spec.name

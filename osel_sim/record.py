@@ -11,6 +11,7 @@ from osel_sim import cli
 from osel_sim.cli.reward_flags import DEFAULT_PRESET
 from osel_sim.core import content
 from osel_sim.core.errors import DataError, OselError, UsageError
+from osel_sim.formats import library
 from osel_sim.run import NOISE_HELP, SPLITS
 
 if TYPE_CHECKING:
@@ -70,12 +71,13 @@ def parser() -> cli.Parser:
 
 def _record(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
+    from osel_sim.core.files import read_json, write_json
     from osel_sim.episodes.declared_skills import declare
     from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.episodes.recording import Recording
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, read_json, start_or_resume, write_json
+    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, start_or_resume
     from osel_sim.sim.gl import choose_backend
 
     added_encoder = options.encoder is not None  # one given is added; the encoder that was there must not have changed
@@ -83,7 +85,7 @@ def _record(options: argparse.Namespace) -> int:
         check_folder(options.out, {}, resume=True)
         _take_settings(options, read_json(options.out / RUN).get("configuration", {}))
     options.repeats, options.repeat_every = options.repeats or 1, options.repeat_every or 1
-    tasks = content.select_tasks(options.task, options.tasks)
+    tasks = library.select_tasks(options.task, options.tasks)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
     if options.out is None:

@@ -12,14 +12,15 @@ from osel_sim import cli
 from osel_sim.cli.reward_flags import add_reward_flags, weights_of
 from osel_sim.core import content
 from osel_sim.core.errors import OselError, UnknownNameError
+from osel_sim.formats import library
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
-    from osel_sim.context.encoder import Encoder
     from osel_sim.episodes.live import LiveRun
     from osel_sim.episodes.tensorboard import TensorBoard
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.formats.task_file import TaskSpec
+    from osel_sim.interface.encoder import Encoder
     from osel_sim.selection.reward import RewardWeights
 
 SPLITS = ("train", "validation", "test")
@@ -90,7 +91,7 @@ def _run(options: argparse.Namespace) -> int:
         from osel_sim.episodes.tensorboard import check_installed
 
         check_installed()
-    tasks = content.select_tasks(options.task, options.tasks)
+    tasks = library.select_tasks(options.task, options.tasks)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
     weights = weights_of(options)[0]
@@ -192,8 +193,8 @@ def _progress(live: "LiveRun") -> str:
 def _report(live: "LiveRun", selector: str) -> None:
     """Write summary, curve, page and the selector's state, and print the table."""
     from osel_sim.cli.console import console, run_table
+    from osel_sim.core.files import write_json
     from osel_sim.figures import learning_curve
-    from osel_sim.formats.run_config import write_json
     from osel_sim.formats.summary import summarise
     from osel_sim.reporting.page import write_page
     from osel_sim.reporting.run_page import run_page
@@ -320,8 +321,9 @@ def _configuration(
     """Everything the journal depends on but the encoder, content of files included. `above`: axes at levels of their own."""
     from dataclasses import asdict
 
+    from osel_sim.core.files import digest
     from osel_sim.formats.rollout_log import ROLLOUTS
-    from osel_sim.formats.run_config import content_digests, digest
+    from osel_sim.formats.run_config import content_digests
 
     warm = {"warm_start": digest(options.warm_start / ROLLOUTS)} if options.warm_start else {}
     return {

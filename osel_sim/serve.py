@@ -63,11 +63,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    from osel_sim.core import content
+    from osel_sim.formats import library
 
     if not 0 <= options.port <= 65535:
         raise UsageError(f"--port must lie in [0, 65535], got {options.port}")
-    spec = content.load_policy(options.policy, options.policies_dir)
+    spec = library.load_policy(options.policy, options.policies_dir)
     given = os.environ.get(options.token_env)
 
     from osel_sim.policy.registry import load_policy

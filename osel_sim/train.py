@@ -7,8 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from osel_sim import cli
-from osel_sim.core import content
 from osel_sim.core.errors import UsageError
+from osel_sim.formats import library
 
 EXAMPLES = """examples:
   python -m osel_sim.train --policy local_small --data data/pick_place --out runs/train/local_small
@@ -91,7 +91,7 @@ def _train_policy(options: argparse.Namespace) -> int:
     for folder in options.data:
         if not folder.is_dir():
             raise UsageError(f"{folder} is not a folder of demonstrations; python -m osel_sim.collect writes one")
-    spec = content.load_policy(options.policy, options.policies_dir)
+    spec = library.load_policy(options.policy, options.policies_dir)
     recipe = load_recipe(options.recipe or find_recipe(options.policy))
     changes = {key: getattr(options, key) for key in ("steps", "batch_size") if getattr(options, key) is not None}
     recipe = replace(recipe, optimisation=replace(recipe.optimisation, **changes), episodes=options.episodes or recipe.episodes)

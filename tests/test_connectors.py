@@ -22,6 +22,7 @@ from osel_sim import doctor
 from osel_sim.core import content
 from osel_sim.core.errors import CheckpointError, ContentError, PolicyError, RemoteError, UsageError
 from osel_sim.episodes.drivers import choose_policies
+from osel_sim.formats import library
 from osel_sim.formats.mapping import Mapping
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.policy.lerobot_policy import load
@@ -149,7 +150,7 @@ def save_act(folder: Path, state: int = 8, action: int = 7, statistics: bool = T
 
 def spec_of(folder: Path, **mapping: Any) -> Any:
     given = {"images": {"agentview": "observation.images.image", "wrist": "observation.images.image2"}} | mapping
-    local = content.load_policy("local_small")
+    local = library.load_policy("local_small")
     return dataclasses.replace(local, cameras=("agentview", "wrist"), image_size=SIZE, checkpoint=str(folder), mapping=Mapping(**given))
 
 

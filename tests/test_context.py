@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 from osel_sim.context.cache import ContextCache
-from osel_sim.context.encoder import Encoder, encode_many, load_encoder
+from osel_sim.context.encoder import encode_many, load_encoder
 from osel_sim.core import content
 from osel_sim.core.errors import CheckpointError, DataError, UnknownNameError, UsageError
 from osel_sim.formats.task_file import TaskSpec, load_task_file
+from osel_sim.interface.encoder import Encoder
 from osel_sim.training.encoder.captions import PLACES, Caption, Captions, truth
 from osel_sim.training.encoder.evaluate import measure, neighbour_agreement
 from osel_sim.training.encoder.scenes import Scenes, render_scenes

@@ -13,7 +13,7 @@ from osel_sim.episodes.subscribers import RealTime
 from osel_sim.episodes.video import Video
 from osel_sim.formats.policy_file import PolicySpec, Price, Remote
 from osel_sim.formats.task_file import load_task_file
-from osel_sim.policy.local import Call
+from osel_sim.interface.call import Call
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.expert import Expert
 from osel_sim.sim.instance import make_instance

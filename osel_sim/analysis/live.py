@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.log import Array, LoggedInstance, LoggedOutcomes, dense, read_contexts
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, read_journal, read_lines
 from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import ROLLOUTS, Row
-from osel_sim.formats.run_config import RUN, read_json
+from osel_sim.formats.run_config import RUN
 from osel_sim.interface.outcome import Outcome, Seconds
 from osel_sim.selection.reward import RewardWeights
 

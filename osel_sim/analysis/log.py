@@ -126,8 +126,8 @@ class LoggedOutcomes:
     def expected_costs(self, weights: RewardWeights) -> dict[str, float]:
         """What a policy is charged for time and price on average where it succeeds: reward = success - cost.
 
-        Stands for what `osel_sim.episodes.expected_costs` computes from a policy's file, which a log does not have. Of a policy that never succeeds it is the average
-        over all its episodes; one without any valid outcome is left out.
+        Stands for what `osel_sim.episodes.expected_costs` computes from a policy's file, which a log does not have. Of a policy that never succeeds
+        it is the average over all its episodes; one without any valid outcome is left out.
         """
         score: Array = getattr(self, weights.success)
         costs = score - self.rewards(weights)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
-from osel_sim.selection.base import Choice, Selector
+from osel_sim.interface.selector import Choice, Selector
 from osel_sim.selection.registry import learns_off_policy, selector_locations
 
 _SALT = 0x3A2E

@@ -1,16 +1,15 @@
 """What all commands share: flags refused with a suggestion, one line for an error, exit code 2 for wrong input."""
 
 import argparse
-import difflib
 import errno
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
-from osel_sim.core.errors import OselError
+from osel_sim.core.errors import OselError, did_you_mean
 
 USAGE = 2
 INTERRUPTED = 130
@@ -77,12 +76,6 @@ class Parser(argparse.ArgumentParser):
             flag = unknown[0].partition("=")[0]
             message = f"unknown argument {unknown[0]!r}: {did_you_mean(flag, self._option_string_actions)}{self.prog} --help lists them"
         self.exit(_complain(message, USAGE))
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`did you mean 'x'? `, or nothing where nothing is near."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}? " if near else ""
 
 
 def positive_int(text: str) -> int:

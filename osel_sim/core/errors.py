@@ -19,10 +19,8 @@ class UnknownNameError(UsageError):
 
     def __init__(self, what: str, name: str, known: Iterable[str], where: str = "") -> None:
         known = sorted(known)
-        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}? " if near else ""
         listing = f"known: {', '.join(known) or 'none'}" + (f" ({where})" if where else "")
-        super().__init__(f"unknown {what} {name!r}: {hint}{listing}")
+        super().__init__(f"unknown {what} {name!r}: {did_you_mean(name, known)}{listing}")
 
 
 class ContentError(OselError):
@@ -50,3 +48,9 @@ class RemoteError(OselError):
 
 class DataError(OselError):
     """A journal, rollout log or dataset cannot be read or does not have the promised form."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """`did you mean 'x'? `, or nothing where nothing is near."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"did you mean {near[0]!r}? " if near else ""

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from osel_sim.context.encoder import Encoder
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError, UnknownNameError
 from osel_sim.core.torch_settings import threads
+from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.task_file import TaskSpec
+from osel_sim.interface.encoder import Encoder
 from osel_sim.selection.skills import Skills
 from osel_sim.sim.instance import make_instance
 
@@ -34,7 +35,7 @@ def declared_skills(spec: PolicySpec, tasks: Path | None = None) -> tuple[str, .
     """
     if spec.skills is not None:
         try:
-            return tuple(task.name for task in content.select_tasks(spec.skills, tasks))
+            return tuple(task.name for task in library.select_tasks(spec.skills, tasks))
         except UnknownNameError as error:
             raise ContentError(spec.file, "skills", str(error)) from None
     checkpoint = content.resolve_checkpoint(spec.checkpoint) if spec.checkpoint else None
@@ -65,7 +66,7 @@ def declare(policies: Sequence[PolicySpec], encoder: Encoder, asked: Sequence[Ta
     able = {policy: names for policy, names in declared.items() if names is not None}
     if not able:
         return None
-    wanted = {task.name: task for task in [*content.select_tasks(sorted({name for own in able.values() for name in own}), tasks), *asked]}
+    wanted = {task.name: task for task in [*library.select_tasks(sorted({name for own in able.values() for name in own}), tasks), *asked]}
     blank = np.zeros((encoder.image_size, encoder.image_size, 3), np.uint8)
     examples = {}
     with threads(1):

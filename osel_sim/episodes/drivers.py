@@ -8,6 +8,7 @@ from typing import Self
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError, OselError, UsageError
 from osel_sim.episodes.loop import Driver
+from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
 
 
@@ -20,7 +21,7 @@ def choose_policies(names: Sequence[str] | None, folder: Path | None = None) -> 
         ContentError: a file is wrong.
     """
     if names is None:
-        specs = [content.load_policy(name, folder) for name in content.files("policies", folder)]
+        specs = [library.load_policy(name, folder) for name in content.files("policies", folder)]
         names = [spec.name for spec in specs if not spec.is_privileged]
     wanted = list(names)
     if not wanted:
@@ -28,7 +29,7 @@ def choose_policies(names: Sequence[str] | None, folder: Path | None = None) -> 
     for name in wanted:
         if wanted.count(name) > 1:
             raise UsageError(f"policy {name!r} is named twice after --policies")
-    return [content.load_policy(name, folder) for name in wanted]
+    return [library.load_policy(name, folder) for name in wanted]
 
 
 def with_fallbacks(specs: Sequence[PolicySpec], folder: Path | None = None) -> list[PolicySpec]:
@@ -43,7 +44,7 @@ def with_fallbacks(specs: Sequence[PolicySpec], folder: Path | None = None) -> l
         if name is None:
             continue
         try:
-            fallback = found.get(name) or content.load_policy(name, folder)
+            fallback = found.get(name) or library.load_policy(name, folder)
         except UsageError as error:
             raise ContentError(spec.file, "remote.fallback", str(error)) from None
         if fallback.is_remote:

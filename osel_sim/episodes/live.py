@@ -18,12 +18,12 @@ from osel_sim.episodes.view import view
 from osel_sim.formats.journal import Decision, Lines, to_decision
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.outcome import Outcome
-from osel_sim.selection.base import Choice, Selector
+from osel_sim.interface.selector import Choice, Selector
 from osel_sim.selection.reward import RewardWeights, reward
 
 if TYPE_CHECKING:
     from osel_sim.context.cache import ContextCache
-    from osel_sim.context.encoder import Encoder
+    from osel_sim.interface.encoder import Encoder
     from osel_sim.sim.instance import Instance
     from osel_sim.sim.task_envs import TaskEnvs
 

@@ -20,10 +20,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.call import Call, Caller, Privileged
 from osel_sim.interface.outcome import Outcome, Seconds
 from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, Actions
-from osel_sim.policy.local import Call, Caller
-from osel_sim.sim.expert_caller import Privileged
 
 if TYPE_CHECKING:
     from osel_sim.sim.env import TaskEnv

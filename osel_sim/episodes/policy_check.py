@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
 from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
+from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.call import Call, Caller, Privileged
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.policy import ACTION_DIM, Observation
-from osel_sim.policy.local import Call, Caller
 from osel_sim.policy.mapping import state_of
-from osel_sim.sim.expert_caller import Privileged
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 OTHER_INSTRUCTION = "leave everything as it is"
@@ -109,7 +109,7 @@ def find_policy(policy: str, folder: Path | None) -> tuple[PolicySpec, Path | No
     from osel_sim.formats.policy_file import load_policy_file
 
     if not policy.endswith(".toml"):
-        return content.load_policy(policy, folder), folder
+        return library.load_policy(policy, folder), folder
     file = Path(policy)
     if not file.is_file():
         raise UsageError(f"{policy}: there is no such policy file")
@@ -242,27 +242,3 @@ def _end(report: Report, outcome: Outcome) -> None:
         report.findings.append((PROBLEM, f"the episode ended as an error: {outcome.error}"))
     elif not outcome.success:
         report.findings.append((NOTE, f"the task was not done within {outcome.steps} steps; {outcome.subgoals:.0%} of its subgoals were reached"))
-
-
-def print_report(report: Report, out: Path) -> None:
-    """The report as tables on the terminal."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    from osel_sim.cli.console import console
-
-    terminal = console()
-    terminal.print(escape(f"{report.policy} on {report.instance}: {report.instruction!r}"))
-    saw = Table("input", "what it was at the first call", title="What it saw", title_justify="left")
-    for key, words in report.inputs.items():
-        saw.add_row(escape(key), escape(words))
-    terminal.print(saw)
-    did = Table("axis", "min", "mean", "max", "std", "at the limit", title=f"What it did: {report.calls} calls", title_justify="left")
-    for axis, row in report.actions.items():
-        did.add_row(axis, *(f"{row[key]:.3f}" for key in ("min", "mean", "max", "std")), f"{row['at_limit']:.0%}")
-    terminal.print(did)
-    end = report.outcome
-    terminal.print(f"{'success' if end['success'] else 'no success'} after {end['steps']} steps, {end['subgoals']:.0%} of the subgoals")
-    for kind, words in report.findings:
-        terminal.print(f"[{'red' if kind == PROBLEM else 'yellow'}]{kind}[/] {escape(words)}")
-    terminal.print(f"pictures and report.json in {out}")

@@ -4,9 +4,9 @@ import time
 from typing import override
 
 from osel_sim.episodes.loop import Frame, Subscriber
+from osel_sim.interface.call import Call
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.policy import CONTROL_HZ
-from osel_sim.policy.local import Call
 
 
 class Timing(Subscriber):

@@ -6,8 +6,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from osel_sim.analysis.log import Array
 from osel_sim.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class TensorBoard:
         self._written = len(live.decisions)
         self._writer.flush()
 
-    def _add(self, decision: "Decision", rewards: Array, policies: "tuple[str, ...] | list[str]") -> None:
+    def _add(self, decision: "Decision", rewards: NDArray[np.float64], policies: "tuple[str, ...] | list[str]") -> None:
         scalars = {f"propensity/{policy}": decision.propensities.get(policy, 0.0) for policy in policies}
         scalars |= {f"chosen/{policy}": float(decision.policy == policy) for policy in policies}
         if decision.error is None and decision.reward is not None:

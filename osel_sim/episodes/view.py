@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from osel_sim.context.encoder import Encoder
+    from osel_sim.interface.encoder import Encoder
     from osel_sim.sim.env import TaskEnv
 
 CAMERA = "agentview"

@@ -3,8 +3,7 @@
 import argparse
 from typing import Any
 
-from osel_sim import cli
-from osel_sim.core.errors import ContentError, UsageError
+from osel_sim.core.errors import ContentError, UsageError, did_you_mean
 from osel_sim.formats.validate import Table
 from osel_sim.ingestion.mapping import COMMAND_LINE, VALUES, flag
 
@@ -47,7 +46,7 @@ def as_table(options: argparse.Namespace, files: tuple[str, ...]) -> FlagTable:
             if equals and policy in policies:
                 policies[policy][key] = _value(key, value, options.at_least)
             elif equals and names:
-                raise UsageError(f"--{key} {item}: unknown policy {policy!r}: {cli.did_you_mean(policy, names)}known: {', '.join(names)}")
+                raise UsageError(f"--{key} {item}: unknown policy {policy!r}: {did_you_mean(policy, names)}known: {', '.join(names)}")
             elif key in outcome:
                 raise UsageError(f"--{key}: {item!r} is the second value for all policies; write POLICY=VALUE, with the policies after --policies")
             else:

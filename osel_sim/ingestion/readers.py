@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from osel_sim import cli
-from osel_sim.core.errors import DataError
+from osel_sim.core.errors import DataError, did_you_mean
 from osel_sim.ingestion.mapping import Join, Mapping, flag
 
 _CAPTURE = re.compile(r"\\\{([A-Za-z_][A-Za-z0-9_]*)\\\}")
@@ -237,7 +236,7 @@ def _joined(records: list[Record], others: list[Record], join: Join) -> list[Rec
 def _instead(record: Record, column: str) -> str:
     """What may have been meant by a column that is not there."""
     columns = list(record.values)
-    return f"{cli.did_you_mean(column, columns)}columns: {', '.join(columns)}" + _other_delimiter(record.file, columns, column)
+    return f"{did_you_mean(column, columns)}columns: {', '.join(columns)}" + _other_delimiter(record.file, columns, column)
 
 
 def _other_delimiter(file: Path, columns: Sequence[str], missing: str | None = None) -> str:

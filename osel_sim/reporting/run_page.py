@@ -14,8 +14,9 @@ from osel_sim.analysis.evaluation import evaluate
 from osel_sim.analysis.live import JOURNAL, LiveLog, read_live
 from osel_sim.analysis.log import Array, LoggedOutcomes
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, read_journal
-from osel_sim.formats.run_config import RUN, read_json
+from osel_sim.formats.run_config import RUN
 from osel_sim.reporting.description import Cell, Column, Figure, Line, Mark, Panel, Table, colours, thinned
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes
 from osel_sim.reporting.html_tables import to_text

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from osel_sim.core.errors import UsageError
-from osel_sim.selection.base import State
+from osel_sim.interface.selector import State
 from osel_sim.selection.bayesian import BayesianSelector
 from osel_sim.selection.features import Array, Components
 

@@ -7,7 +7,7 @@ from importlib.metadata import entry_points
 from typing import Any, cast
 
 from osel_sim.core.errors import UnknownNameError, UsageError
-from osel_sim.selection.base import Selector
+from osel_sim.interface.selector import Selector
 
 ENTRY_POINTS = "osel_sim.selectors"
 """Entry-point group in which other packages offer selectors: `name = "module:Class"`."""

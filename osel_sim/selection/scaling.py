@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.selection.base import Context, State
+from osel_sim.interface.selector import Context, State
 from osel_sim.selection.features import Components, Sketch
 
 FIRST, LAST = 16, 2048

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
-from osel_sim.selection.base import Context
+from osel_sim.interface.selector import Context
 
 Array = NDArray[np.float64]
 

@@ -1,24 +1,15 @@
 """The scripted expert as a policy: the ceiling that policies which only see can be compared with."""
 
 import time
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 from osel_sim.core.errors import PolicyError
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.call import Call
 from osel_sim.interface.policy import Observation
-from osel_sim.policy.local import Call
 
 if TYPE_CHECKING:
     from osel_sim.sim.env import TaskEnv
-
-
-@runtime_checkable
-class Privileged(Protocol):
-    """A caller that wants to see the world itself; the episode loop shows it the environment before anything else."""
-
-    def bind(self, env: "TaskEnv") -> None:
-        """Remember the environment of the coming episode. It must be looked at, never changed."""
-        ...
 
 
 class ExpertCaller:

@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
-from osel_sim.selection.base import Choice, Context, SelectorBase, State
+from osel_sim.interface.selector import Choice, Context, State
+from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.random_streams import RandomStreams
 
 if TYPE_CHECKING:

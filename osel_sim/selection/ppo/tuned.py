@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
-from osel_sim.selection.base import Choice, Context, State
+from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.ppo.sb3 import PPOSelector
 from osel_sim.selection.scaling import RunningComponents
 

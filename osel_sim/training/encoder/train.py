@@ -10,10 +10,10 @@ from typing import Any
 
 from osel_sim import cli
 from osel_sim.context.encoder import DEFAULT_ENCODER, WEIGHTS
-from osel_sim.core.content import select_tasks
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
 from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.formats.levels import LEVELS
+from osel_sim.formats.library import select_tasks
 
 STATE = "training_state.pt"
 REPORT = "training.json"
