@@ -54,3 +54,16 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """`did you mean 'x'? `, or nothing where nothing is near."""
     near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
     return f"did you mean {near[0]!r}? " if near else ""
+
+
+class SettingError(UsageError):
+    """A setting of a command has a value it cannot work with. The command line shows the setting as a flag.
+
+    Attributes:
+        setting: name of the setting.
+        problem: what is wrong with its value.
+    """
+
+    def __init__(self, setting: str, problem: str) -> None:
+        super().__init__(f"{setting}: {problem}" if setting else problem)
+        self.setting, self.problem = setting, problem
