@@ -7,6 +7,7 @@ from typing import Any
 
 from osel_sim.api.record import RecordConfig
 from osel_sim.cli.command import Command
+from osel_sim.core.errors import DataError, SettingError
 
 EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine
@@ -41,7 +42,6 @@ def _print_summary(folder: Path) -> None:
     from osel_sim.api.reward import DEFAULT_PRESET
     from osel_sim.cli.console import console
     from osel_sim.cli.rollout_tables import print_rollouts
-    from osel_sim.core.errors import DataError
     from osel_sim.formats.rollout_log import read_rollouts
     from osel_sim.selection.reward import preset
 
@@ -54,6 +54,8 @@ def _print_summary(folder: Path) -> None:
 
 
 def _summary(given: Mapping[str, Any]) -> int:
+    if not given["summary"].is_dir():
+        raise SettingError("summary", f"there is no folder {given['summary']}")
     _print_summary(given["summary"])
     return 0
 

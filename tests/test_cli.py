@@ -52,19 +52,19 @@ needs_log = Command("demo", LogConfig, show, "")
     ("arguments", "message"),
     [
         ("--episodes 0", "--episodes: must be 1 or more, got 0"),
-        ("--episodes many", '--episodes: unable to convert "many" into int'),
+        ("--episodes many", "--episodes: must be an integer, got 'many'"),
         ("--episodes", "--episodes: needs a value"),
         ("--alpha -0.1", "--alpha: must be 0 or more, got -0.1"),
         ("--alpha nan", "--alpha: must be a finite number, got nan"),
-        ("--alpha much", '--alpha: unable to convert "much" into float'),
+        ("--alpha much", "--alpha: must be a number, got 'much'"),
         ("--seed -1", "--seed: must be 0 or more, got -1"),
         ("--level", "--level: needs at least one value"),
         ("--level 0 -1", "--level: must be 0 or more, got -1"),
         ("--tasks /no/such", "--tasks: there is no folder /no/such"),
         ("--tasks /dev/null", "--tasks: /dev/null is not a folder"),
-        ("--split tets", 'Did you mean "test"?'),
-        ("--epsodes 3", "unknown option: --epsodes. Did you mean --episodes?"),
-        ("--epi 3", "unknown option: --epi"),
+        ("--split tets", "--split: unknown value 'tets': did you mean 'test'? known: train, validation, test"),
+        ("--epsodes 3", "unknown argument '--epsodes': did you mean '--episodes'? --help lists them"),
+        ("--epi 3", "unknown argument '--epi'"),
         ("stray", "unknown argument 'stray'"),
     ],
 )
@@ -74,6 +74,12 @@ def test_wrong_flags_get_one_line_and_exit_code_2(arguments: str, message: str, 
     assert error.startswith("error: ")
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_flag_given_twice_means_the_last_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert demo(["--level", "0", "2", "--episodes=4", "--level", "1", "--episodes", "5"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["level"], found["episodes"]) == ([1], 5)
 
 
 def test_a_positional_setting_is_needed(capsys: pytest.CaptureFixture[str]) -> None:

@@ -267,7 +267,7 @@ def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
     arguments = list(map(str, command(world, "record", *SIZE, "--out", reference[0])[3:]))
     before = files(reference[0])
     assert record_main([*arguments, "--resume"]) == 0
-    assert "is complete" in capsys.readouterr().out
+    assert "is complete" in capsys.readouterr().err
     assert files(reference[0]) == before
 
 

@@ -66,7 +66,7 @@ class ReplayConfig(LoggedRewardSettings):
 def replay(
     log: "Path | str | ReplayConfig",
     *,
-    selectors: "Sequence[str | Factory] | None" = None,
+    selectors: "str | Sequence[str | Factory] | None" = None,
     on_result: Callable[[ReplayResult], None] | None = None,
     **values: Any,
 ) -> ReplayResult:
@@ -82,6 +82,8 @@ def replay(
         OselError: whatever is wrong with the settings or the log; the message says what.
     """
     factories: dict[str, Factory] = {}
+    if isinstance(selectors, str):
+        selectors = [selectors]
     if selectors is not None:
         factories = {_name(selector): selector for selector in selectors if not isinstance(selector, str)}
         values["selectors"] = [selector if isinstance(selector, str) else _name(selector) for selector in selectors]

@@ -8,16 +8,15 @@ import errno
 import functools
 import inspect
 import os
-import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from osel_sim.api.settings import MAIN, OTHER, Group, Settings
 from osel_sim.cli.output import show_log
-from osel_sim.core.errors import OselError, SettingError, UnknownNameError, UsageError
+from osel_sim.core.errors import OselError, SettingError, UnknownNameError, UsageError, did_you_mean
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -74,7 +73,7 @@ class Command[Config: Settings]:
             help=inspect.getdoc(self.config) or "",
             help_format="plaintext",
             version_flags=[],
-            default_parameter=Parameter(negative="", consume_multiple=True),
+            default_parameter=Parameter(negative="", consume_multiple=True, allow_repeating=True),
         )
         app["--help"].group = _group(OTHER)
         app.default(self._function())
@@ -89,10 +88,24 @@ class Command[Config: Settings]:
             print(self.examples)  # as they are: cyclopts would fold their lines
             return 0
         try:
-            code = app(words, exit_on_error=False, print_error=False, result_action="return_value")
+            code = app(self._last_wins(words), exit_on_error=False, print_error=False, result_action="return_value")
         except CycloptsError as error:
             raise UsageError(_one_line(error)) from None
         return code if isinstance(code, int) else 0
+
+    def _last_wins(self, words: Sequence[str]) -> list[str]:
+        """The words without what a later flag of the same name replaces; only `--axis` adds up.
+
+        cyclopts would join the values of a list given twice, so that `make run ARGS="--policies mine"` would add to the policies instead.
+        """
+        kept: list[list[str]] = [[]]
+        for word in words:
+            if word.startswith("--"):
+                kept.append([])
+            kept[-1].append(word)
+        names = [part[0].partition("=")[0] if part else "" for part in kept]
+        last = {name: index for index, name in enumerate(names)}
+        return [word for index, (name, part) in enumerate(zip(names, kept, strict=True)) if name == "--axis" or last[name] == index for word in part]
 
     def _function(self) -> Callable[..., int]:
         signature = inspect.Signature([*self._parameters()])
@@ -193,9 +206,10 @@ def _parameter(field: "Field[Any]", hint: Any, description: str) -> inspect.Para
     needed = field.default is MISSING and field.default_factory is MISSING
     default = inspect.Parameter.empty if needed else field.default
     shown = not needed and default is not None and default != () and default is not False
+    choices = _choices(hint)
     flag = Parameter(
         name=field.name.upper() if needed else None,
-        help=" ".join(description.split()),
+        help=" ".join(description.split()) + (f": {', '.join(choices)}" if choices else ""),
         group=_group(MAIN if needed else group),
         show_default=_words if shown else False,
     )
@@ -220,9 +234,18 @@ def _plain_type(hint: Any) -> Any:
     arguments = get_args(hint)
     if get_origin(hint) is tuple:
         return tuple[*(part if part is ... else _plain_type(part) for part in arguments)]  # type: ignore[misc]
+    if get_origin(hint) is Literal:
+        return type(arguments[0])  # the configuration checks it, and says what would be near
     if type(None) in arguments:
         return functools.reduce(lambda left, right: left | right, (_plain_type(part) for part in arguments))
     return hint
+
+
+def _choices(hint: Any) -> list[str]:
+    """The values of a hint that lists them; empty for any other."""
+    if get_origin(hint) is Literal:
+        return [str(value) for value in get_args(hint)]
+    return [choice for part in get_args(hint) if part is not hint for choice in _choices(part)]
 
 
 def _words(value: Any) -> str:
@@ -237,12 +260,22 @@ def _group(group: Group) -> Any:
 
 
 def _one_line(error: Exception) -> str:
-    """A parsing error of cyclopts as one line that begins with a small letter."""
+    """A parsing error of cyclopts in the words of our own errors."""
+    from cyclopts import CoercionError, MissingArgumentError, UnknownOptionError, UnusedCliTokensError
+
     text = " ".join(str(error).split())
-    if (missing := re.fullmatch(r"Parameter (\S+) requires an argument\.", text)) is not None:
-        return f"{missing.group(1)} is missing" if missing.group(1).isupper() else f"{missing.group(1)}: needs a value"
-    if (unused := re.fullmatch(r"Unused Tokens: \[(.*)\]\.", text)) is not None:
-        return f"unknown argument {unused.group(1)}"
+    if isinstance(error, UnknownOptionError):
+        flag = str(error.token.keyword or error.token.value).partition("=")[0]
+        known = [name for argument in error.argument_collection for name in argument.names]
+        return f"unknown argument {flag!r}: {did_you_mean(flag, known)}--help lists them"
+    if isinstance(error, UnusedCliTokensError):
+        return f"unknown argument {str((error.unused_tokens or ['?'])[0])!r}: --help shows what there is"
+    if isinstance(error, MissingArgumentError) and error.argument is not None:
+        name = error.argument.name
+        return f"{name}: needs a value" if name.startswith("-") else f"{name} is missing"
+    if isinstance(error, CoercionError) and error.argument is not None and error.token is not None and error.target_type in (int, float):
+        kind = "an integer" if error.target_type is int else "a number"
+        return f"{error.argument.name}: must be {kind}, got {str(error.token.value)!r}"
     return text[:1].lower() + text[1:]
 
 
