@@ -57,6 +57,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
     parser.add_argument("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
+    cli.add_trust_flag(parser)
     parser.add_argument("--policy", metavar="NAME|FILE", help="run one instance with this policy and report on it")
     parser.add_argument("--task", default="pick_place", help="task of that instance (default: %(default)s)")
     parser.add_argument("--seed", type=cli.non_negative_int, default=0, help="seed of that instance (default: %(default)s)")

@@ -94,6 +94,7 @@ def parser() -> cli.Parser:
     add("--frames", type=cli.positive_int, metavar="N", help="frames of each episode, evenly spread; each is an instance (default: 4)")
     add("--tolerance", type=cli.non_negative_float, metavar="MSE", help="success is an error of so much or less (default: 0.05)")
     add("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
+    cli.add_trust_flag(result)
     return result
 
 

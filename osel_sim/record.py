@@ -66,6 +66,7 @@ def parser() -> cli.Parser:
     add("--summary", type=cli.folder, metavar="DIR", help="print the tables of the log in DIR, and leave")
     add("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
     add("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
+    cli.add_trust_flag(result)
     return result
 
 

@@ -79,6 +79,7 @@ def parser() -> cli.Parser:
     add("--realtime", action="store_true", help="sleep so that the robot moves in real time")
     add("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
     add("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
+    cli.add_trust_flag(result)
     return result
 
 

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from osel_sim import cli
 from osel_sim.core.errors import OselError, UsageError
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
@@ -58,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--port", type=int, default=8000, help="port, 0 for a free one (default: %(default)s)")
     parser.add_argument("--token-env", default=TOKEN_VARIABLE, metavar="VARIABLE", help="environment variable with the token (default: %(default)s)")
     parser.add_argument("--policies-dir", type=Path, metavar="DIR", help="folder with policy files of your own")
+    cli.add_trust_flag(parser)
     parser.add_argument("--watch-stdin", action="store_true", help="stop when standard input ends (for a program that starts the server)")
     return parser
 

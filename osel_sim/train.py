@@ -38,6 +38,7 @@ def parser() -> cli.Parser:
     result.add_argument("--out", metavar="DIR", type=Path, help="checkpoint folder to write (default: runs/train/NAME)")
     result.add_argument("--recipe", metavar="FILE", type=Path, help="sizes and settings (default: policies/training/NAME.toml)")
     result.add_argument("--policies-dir", metavar="DIR", type=Path, help="further policy files")
+    cli.add_trust_flag(result)
     result.add_argument("--tasks", metavar="DIR", type=Path, help="further task files, for --eval-episodes")
     budget = result.add_mutually_exclusive_group()
     budget.add_argument("--steps", type=int, help="number of steps (default: the recipe's)")

@@ -5,11 +5,12 @@ import errno
 import functools
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
-from osel_sim.core.errors import OselError, did_you_mean
+from osel_sim.core.errors import OselError, UsageError, did_you_mean
+from osel_sim.core.trust import VARIABLE, trust
 
 USAGE = 2
 INTERRUPTED = 130
@@ -27,6 +28,7 @@ def main(function: Command) -> Command:
 
     @functools.wraps(function)
     def wrapped(arguments: list[str] | None = None) -> int:
+        trusted = os.environ.get(VARIABLE)
         try:
             code = function(arguments)
             sys.stdout.flush()
@@ -44,8 +46,33 @@ def main(function: Command) -> Command:
             if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
             return _complain(f"{error.filename}: {error.strerror}" if error.filename is not None else str(error.strerror), USAGE)
+        finally:  # what one command was allowed is not the next one's, in a process that calls several
+            os.environ.pop(VARIABLE, None)
+            if trusted is not None:
+                os.environ[VARIABLE] = trusted
 
     return wrapped
+
+
+def add_trust_flag(command: argparse.ArgumentParser) -> None:
+    """Add `--trust MODULE`, which may be repeated. It takes effect as it is read, here and in child processes."""
+    command.add_argument(
+        "--trust",
+        action=_Trust,
+        default=argparse.SUPPRESS,
+        metavar="MODULE",
+        help="module, or model repository (owner/name), whose code a checkpoint may ask for; may be repeated (docs/security.md)",
+    )
+
+
+class _Trust(argparse.Action):
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: str | Sequence[Any] | None, option: str | None = None
+    ) -> None:
+        try:
+            trust([str(values)])
+        except UsageError as error:
+            raise argparse.ArgumentError(None, str(error)) from None
 
 
 class Parser(argparse.ArgumentParser):
