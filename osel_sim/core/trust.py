@@ -10,6 +10,7 @@ import importlib.util
 import os
 import re
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -75,7 +76,9 @@ def find_class(path: object, packages: Sequence[str], base: type, outside: Path)
     if _lies_in(module_name.partition(".")[0], outside):
         raise ForeignCodeError(f"names {shown}, which would be imported from the folder that is being loaded: {outside}")
     try:
-        found = getattr(importlib.import_module(module_name), class_name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of an old name, which is nothing that the user wrote
+            found = getattr(importlib.import_module(module_name), class_name)
     except Exception as error:  # a module of an allowed package may lack what it imports itself
         raise ForeignCodeError(f"names {shown}, which cannot be imported ({type(error).__name__}: {str(error)[:120]})") from None
     if not isinstance(found, type) or not issubclass(found, base):
