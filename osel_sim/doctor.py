@@ -9,6 +9,7 @@ from typing import Annotated
 from osel_sim.api.settings import MAIN, ContentSettings, Index, settings
 from osel_sim.cli.command import Command
 from osel_sim.cli.machine_checks import MISSING, NOTE, OK, Check, examine
+from osel_sim.core.trust import trusting
 
 EXAMPLES = """examples:
   python -m osel_sim.doctor
@@ -39,7 +40,8 @@ class DoctorConfig(ContentSettings):
 
 def _execute(config: DoctorConfig) -> int:
     if config.policy is not None:
-        return _examine_policy(config, config.policy)
+        with trusting(config.trust):
+            return _examine_policy(config, config.policy)
     checks = examine(config.tasks, config.policies_dir)
     ready = all(check.state != MISSING for check in checks)
     if config.json:

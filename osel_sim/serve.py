@@ -12,9 +12,10 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated
 
-from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, Settings, settings
+from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
 from osel_sim.cli.command import Command
 from osel_sim.core.errors import SettingError, UsageError
+from osel_sim.core.trust import trusting
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ One line of JSON on standard output says when it is ready. GET /healthz needs no
 
 
 @settings
-class ServeConfig(Settings):
+class ServeConfig(TrustSettings):
     """Serve a policy over WebSocket (openpi's protocol)."""
 
     policy: str
@@ -53,7 +54,8 @@ def _execute(config: ServeConfig) -> int:
     logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING)
     if config.watch_stdin:
         threading.Thread(target=_stop_with_stdin, daemon=True).start()
-    return _serve(config)
+    with trusting(config.trust):
+        return _serve(config)
 
 
 def _serve(config: ServeConfig) -> int:

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from osel_sim.api.results import frame
-from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Folder, Group, Names, NonNegative, Settings, settings
+from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Folder, Group, Names, NonNegative, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UsageError
+from osel_sim.core.trust import trusting
 from osel_sim.ingestion.mapping import VALUES
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ DATASET = Group("A LeRobotDataset, with --metric action-mse", 2)
 
 
 @settings
-class IngestConfig(Settings):
+class IngestConfig(TrustSettings):
     """Turn outcome tables of others into a rollout log with contexts."""
 
     out: Annotated[Path | None, MAIN] = None
@@ -139,11 +140,12 @@ def ingest(config: IngestConfig | None = None, /, **values: Any) -> IngestResult
     config = IngestConfig.of(**values) if config is None else config.changed(**values)
     if config.out is None:
         raise SettingError("out", "is missing: give the folder to write to")
-    if config.metric == "action-mse":
-        _refuse(config, (*TABLE_FLAGS, "map", "files"), "--metric action-mse")
-        return _action_mse(config, config.out)
-    _refuse(config, ("dataset", "policies_dir", "camera", "frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
-    return _table(config, config.out)
+    with trusting(config.trust):
+        if config.metric == "action-mse":
+            _refuse(config, (*TABLE_FLAGS, "map", "files"), "--metric action-mse")
+            return _action_mse(config, config.out)
+        _refuse(config, ("dataset", "policies_dir", "camera", "frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
+        return _table(config, config.out)
 
 
 def _refuse(config: IngestConfig, names: Sequence[str], with_what: str) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 from osel_sim.api.results import RecordResult
 from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Index, InstanceSettings, Names, settings
 from osel_sim.core.errors import DataError, OselError, SettingError
+from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
     from osel_sim.episodes.recording import Recording
@@ -63,7 +64,8 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
         config = _as_begun(config, given)
     if config.out is None:
         raise SettingError("out", "is missing: give the folder to write to")
-    return _record(config, config.out, "encoder" in given)
+    with trusting(config.trust):
+        return _record(config, config.out, "encoder" in given)
 
 
 def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordResult:

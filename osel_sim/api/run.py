@@ -24,6 +24,7 @@ from osel_sim.api.settings import (
     settings,
 )
 from osel_sim.core.errors import UnknownNameError
+from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
@@ -116,7 +117,8 @@ def run(
         values["selector"] = selector if isinstance(selector, str) else _name(selector)
         factory = None if isinstance(selector, str) else selector
     config = RunConfig.of(**values) if config is None else config.changed(**values)
-    return _Run(config, objects, factory).execute()
+    with trusting(config.trust):
+        return _Run(config, objects, factory).execute()
 
 
 def _name(factory: Any) -> str:

@@ -178,7 +178,15 @@ class LoggedRewardSettings(RewardSettings):
 
 
 @settings
-class ContentSettings(Settings):
+class TrustSettings(Settings):
+    """What data may ask for."""
+
+    trust: Annotated[Names, OTHER] = ()
+    """module, or model repository (owner/name), whose code a checkpoint may ask for; may be repeated (docs/security.md)"""
+
+
+@settings
+class ContentSettings(TrustSettings):
     """Folders with a user's own task and policy files."""
 
     tasks: Annotated[Folder | None, CONTENT] = None

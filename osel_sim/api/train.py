@@ -8,14 +8,15 @@ from typing import Annotated, Any, Literal
 from annotated_types import Gt, Lt
 from pydantic import AllowInfNan
 
-from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Index, Names, Settings, settings
+from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Index, Names, Settings, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UnknownNameError, UsageError
+from osel_sim.core.trust import trusting
 
 Minutes = Annotated[float, Gt(0.0), Lt(1e5), AllowInfNan(False)]
 
 
 @settings
-class TrainConfig(Settings):
+class TrainConfig(TrustSettings):
     """Train a policy on demonstrations (a LeRobotDataset, as osel_sim.collect writes it) into a LeRobot checkpoint folder.
 
     Uses a CUDA GPU where there is one.
@@ -136,7 +137,8 @@ def train(config: TrainConfig | None = None, /, **values: Any) -> tuple[Path, di
         tasks=config.tasks,
         init=config.init,
     )
-    return out, policy_training.train(spec, recipe, config.data, options)
+    with trusting(config.trust):
+        return out, policy_training.train(spec, recipe, config.data, options)
 
 
 def train_encoder(config: EncoderTrainConfig | None = None, /, **values: Any) -> tuple[Path, dict[str, Any]]:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 USAGE = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
+ADDING = ("--axis", "--camera", "--trust")
+"""Flags that may be repeated, each time with more."""
 
 Main = Callable[[Sequence[str] | None], int]
 """Takes the command line's words (None: those of the process), returns the exit code."""
@@ -94,7 +96,7 @@ class Command[Config: Settings]:
         return code if isinstance(code, int) else 0
 
     def _last_wins(self, words: Sequence[str]) -> list[str]:
-        """The words without what a later flag of the same name replaces; only `--axis` adds up.
+        """The words without what a later flag of the same name replaces; those of `ADDING` add up.
 
         cyclopts would join the values of a list given twice, so that `make run ARGS="--policies mine"` would add to the policies instead.
         """
@@ -105,7 +107,7 @@ class Command[Config: Settings]:
             kept[-1].append(word)
         names = [part[0].partition("=")[0] if part else "" for part in kept]
         last = {name: index for index, name in enumerate(names)}
-        return [word for index, (name, part) in enumerate(zip(names, kept, strict=True)) if name == "--axis" or last[name] == index for word in part]
+        return [word for index, (name, part) in enumerate(zip(names, kept, strict=True)) if name in ADDING or last[name] == index for word in part]
 
     def _function(self) -> Callable[..., int]:
         signature = inspect.Signature([*self._parameters()])
