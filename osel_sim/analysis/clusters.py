@@ -10,7 +10,7 @@ from osel_sim.analysis.estimate import Estimate, mean_of
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.outcomes import OutcomeRates, rates_of
 from osel_sim.core.errors import DataError
-from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
+from osel_sim.selection.reward import RewardWeights, counted_time
 
 MOST_CLUSTERS = 40
 FEWEST_MEMBERS = 8  # a cluster of fewer on average says nothing about its policies
@@ -235,5 +235,5 @@ def score_of(log: LoggedOutcomes, weights: RewardWeights) -> Array:
 
 def time_of(log: LoggedOutcomes, weights: RewardWeights) -> Array:
     """The time the reward counts, (N, P), mean over the repeats: steps, or log10 of the seconds; 0 where the log has none."""
-    values = log.steps if weights.time_unit == "steps" else np.log10(np.maximum(log.seconds, FLOOR_SECONDS))
+    values = counted_time(weights, log.steps, log.seconds)
     return mean_over_repeats(values if np.isfinite(values).any() else np.zeros_like(values))

@@ -8,13 +8,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import ndtr
 
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.features import Array, Features, Sketch
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
+from osel_sim.statistics.best import gauss_hermite, probability_of_best
 
 INTERCEPT = 0.5
 """Prior variance of a policy's mean reward, in units of the noise. Strong: no context is needed to find the best single policy."""
@@ -30,9 +30,6 @@ GROWTH = 1.25
 
 WARM = 2000
 """Of more warm contexts than these, evenly spaced ones are taken."""
-
-NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(32)
-WEIGHTS = WEIGHTS / WEIGHTS.sum()
 
 
 class BayesianSelector(SelectorBase):
@@ -130,7 +127,8 @@ class BayesianSelector(SelectorBase):
         deviations = np.sqrt(self._noise * variances)
         # 1 / variance is how many decisions, this policy's, told about contexts like this one.
         optimism = self.optimism * math.sqrt(1.0 + 0.25 * math.log1p((1.0 / variances).sum()))
-        propensities = highest((self._means * rows).sum(axis=1) - self._costs + optimism * deviations, self.chance * deviations)
+        scores = (self._means * rows).sum(axis=1) - self._costs + optimism * deviations
+        propensities = probability_of_best(scores, self.chance * deviations, gauss_hermite())
         index = int(self._generator.choice(len(self.policies), p=propensities))
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
@@ -254,20 +252,3 @@ class BayesianSelector(SelectorBase):
         self._signal, self._noise, self._next_fit = state["model"]
         self._generator.bit_generator.state = state["random"]
         self._features.load({key.removeprefix("features."): value for key, value in state.items() if key.startswith("features.")})
-
-
-def highest(means: Array, deviations: Array) -> Array:
-    """Probability that each of several independent Gaussians is the highest, (n,), summing to 1; those without deviation that tie share it.
-
-    Integrated numerically over each one's own distribution; exact as the probabilities of a choice, because the choice is drawn from them.
-    """
-    if len(means) == 1:
-        return np.ones(1)
-    if not (deviations > 0.0).all():
-        best = means == means.max()
-        return np.asarray(best / best.sum(), np.float64)
-    values = means[:, None] + deviations[:, None] * NODES
-    below = ndtr((values[:, None, :] - means[None, :, None]) / deviations[None, :, None])
-    below[np.arange(len(means)), np.arange(len(means))] = 1.0
-    probabilities = below.prod(axis=1) @ WEIGHTS
-    return np.asarray(probabilities / probabilities.sum())
