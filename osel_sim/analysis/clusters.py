@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.analysis.cross_fit import Rows, best_of_group, cross_fit
 from osel_sim.analysis.estimate import Estimate, mean_of
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.outcomes import OutcomeRates, rates_of
@@ -200,14 +201,11 @@ def _held_out(rewards: Array, labels: NDArray[np.int64], first: NDArray[np.bool_
     """Mean over all instances of (policy its cluster would take) - (policy all would take), each chosen on the half the instance is not in."""
     if first.all() or not first.any():
         return None
-    differences = np.empty(len(rewards))
-    for choosing in (first, ~first):
-        overall = int(rewards[choosing].mean(axis=0).argmax())
-        for number in np.unique(labels):
-            known, scored = choosing & (labels == number), ~choosing & (labels == number)
-            choice = int(rewards[known].mean(axis=0).argmax()) if known.any() else overall
-            differences[scored] = rewards[scored, choice] - rewards[scored, overall]
-    return mean_of(differences)
+
+    def difference(by: Rows, on: Rows) -> Array:
+        return np.asarray(rewards[on, best_of_group(rewards, labels, by, on)] - rewards[on, rewards[by].mean(axis=0).argmax()], np.float64)
+
+    return mean_of(cross_fit(first, difference))
 
 
 def _about(log: LoggedOutcomes, rows: NDArray[np.bool_]) -> str:

@@ -95,7 +95,8 @@ def combined(weights: RewardWeights, score: ArrayLike, time: ArrayLike, price: A
 
 def charge(weights: RewardWeights, time: ArrayLike, price: ArrayLike) -> Array:
     """What an outcome's time and price take off its reward: alpha_time * time + alpha_price * price."""
-    return np.asarray(0.0 - combined(weights, 0.0, time, price), np.float64)
+    nothing = np.zeros(np.broadcast_shapes(np.shape(time), np.shape(price)))
+    return np.asarray(nothing - combined(weights, nothing, time, price), np.float64)
 
 
 def counted_time(weights: RewardWeights, steps: ArrayLike, seconds: ArrayLike) -> Array:
