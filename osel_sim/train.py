@@ -1,20 +1,29 @@
 """python -m osel_sim.train: trains a policy from demonstrations, or the context encoder."""
 
 import argparse
+import json
 import os
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 from osel_sim import cli
-from osel_sim.core.errors import UsageError
+from osel_sim.context.encoder import DEFAULT_ENCODER
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats import library
+from osel_sim.formats.levels import LEVELS
+from osel_sim.training.encoder.train import Settings
 
 EXAMPLES = """examples:
   python -m osel_sim.train --policy local_small --data data/pick_place --out runs/train/local_small
   python -m osel_sim.train --policy local_small --data data/pick_place --out runs/train/local_small --resume
   python -m osel_sim.train --policy remote_large --data data/mine --init assets/policies/remote_large --steps 2000     (adapt it to more data)
   python -m osel_sim.train --encoder osel_small --data data/scenes     (the context encoder instead; --encoder --help tells more)
+"""
+
+ENCODER_EXAMPLES = """examples:
+  python -m osel_sim.train --encoder osel_small --data data/scenes
+  python -m osel_sim.train --encoder osel_small --data data/scenes --task all --level 0 1 2 --steps 3000 --out runs/train/osel_small
 """
 
 
@@ -59,15 +68,48 @@ def parser() -> cli.Parser:
     return result
 
 
+def encoder_parser() -> cli.Parser:
+    """The command line with --encoder."""
+    defaults = Settings()
+    result = cli.Parser(
+        "train", "Train the context encoder on rendered scenes and their instructions, and measure it on unseen ones.", ENCODER_EXAMPLES
+    )
+    add = result.add_argument
+    add("--encoder", metavar="NAME", nargs="?", const=DEFAULT_ENCODER, required=True, help=f"architecture: {DEFAULT_ENCODER}, the only one so far")
+    add("--data", type=Path, required=True, metavar="DIR", help="rendered scenes are kept here, and rendered if missing")
+    add("--out", type=Path, metavar="DIR", help="the checkpoint's folder (default: DATA/<encoder>); load it with --encoder DIR")
+    add("--task", nargs="+", default=list(defaults.tasks), help="names, tag:TAG, or all (default: pick_place)")
+    add("--level", nargs="+", type=int, choices=LEVELS, default=list(defaults.levels), help="levels of the scenes, in turn (default: 0)")
+    length = result.add_mutually_exclusive_group()
+    length.add_argument("--steps", type=int, default=defaults.steps, help="gradient steps (default: %(default)s)")
+    length.add_argument("--minutes", type=float, help="as many steps as fit, measured first")
+    add("--scenes", type=int, default=defaults.scenes, help="training scenes of each task (default: %(default)s)")
+    add("--test-scenes", type=int, default=defaults.test_scenes, help="test scenes of each task to measure on (default: %(default)s)")
+    add("--seed", type=int, default=defaults.seed)
+    add("--device", default="", help="torch device (default: cuda if there, else cpu)")
+    add("--resume", action="store_true", help="go on from the last saved state in the checkpoint's folder, to --steps")
+    return result
+
+
 @cli.main
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if any(argument.partition("=")[0] == "--encoder" for argument in arguments):
-        from osel_sim.training.encoder import train as encoder_training
-
-        return encoder_training.main(arguments)
+        return _train_encoder(encoder_parser().parse_args(arguments))
     return _train_policy(parser().parse_args(arguments))
+
+
+def _train_encoder(options: argparse.Namespace) -> int:
+    from osel_sim.training.encoder.train import train
+
+    if options.encoder != DEFAULT_ENCODER:
+        raise UnknownNameError("encoder to train", options.encoder, [DEFAULT_ENCODER])
+    tasks = tuple(task.name for task in library.select_tasks(options.task))
+    settings = Settings(tasks, tuple(options.level), options.steps, options.seed, options.scenes, options.test_scenes)
+    report = train(settings, options.data, options.out or options.data / options.encoder, options.minutes, options.device, options.resume)
+    print(json.dumps(report["measured"], indent=2))
+    return 0
 
 
 def _train_policy(options: argparse.Namespace) -> int:

@@ -299,9 +299,9 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(recipe, "make_batch", interrupted)
-        patch.setattr(training, "SAVE_SECONDS", -1.0)  # after every step
+        patch.setattr(training, "SAVE_EVERY", 1)
         train(settings, tmp_path, tmp_path / "cut")
-    assert (tmp_path / "cut" / "training_state.pt").exists()
+    assert (tmp_path / "cut" / "training.state").exists()
     with pytest.raises(CheckpointError, match="was trained with seed 0"):
         train(replace(settings, seed=1), tmp_path, tmp_path / "cut", resume=True)
     train(settings, tmp_path, tmp_path / "cut", resume=True)
@@ -309,10 +309,27 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
     measured = whole["measured"]
     assert measured["task"]["neighbours"]["chance"] == 0.5
     assert "image_to_instruction" in measured["tasks"]["pick_place"] and "image_to_instruction" not in measured["tasks"]["sort"]  # names no object
-    assert whole["settings"]["steps"] == 4 and not (tmp_path / "cut" / "training_state.pt").exists()
+    assert whole["settings"]["steps"] == 4 and not (tmp_path / "cut" / "training.state").exists()
     assert load_encoder(str(tmp_path / "whole")).dimension == 256
     with pytest.raises(UsageError, match="holds a checkpoint already"):
         train(settings, tmp_path, tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"steps": 0}, "steps must be 1 or more"),
+        ({"views": 0}, "views must be 1 or more"),
+        ({"levels": (0, 4)}, "unknown level '4'"),
+        ({"tasks": ()}, "at least one task"),
+        ({"rate": float("nan")}, "rate must be a positive number"),
+    ],
+)
+def test_settings_are_checked_when_they_are_made(settings: dict[str, Any], says: str) -> None:
+    from osel_sim.training.encoder.train import Settings
+
+    with pytest.raises(UsageError, match=says):
+        Settings(**settings)
 
 
 @pytest.mark.parametrize(
@@ -320,8 +337,8 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
     [
         (["--encoder", "osel_smal"], "did you mean 'osel_small'"),
         (["--task", "pick_plac"], "did you mean 'pick_place'"),
-        (["--steps", "0"], "--steps must be 1 or more, got 0"),
-        (["--minutes", "-1"], "--minutes must be more than 0"),
+        (["--steps", "0"], "steps must be 1 or more, got 0"),
+        (["--minutes", "-1"], "minutes must be more than 0"),
     ],
 )
 def test_wrong_training_arguments_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], says: str) -> None:
