@@ -127,7 +127,7 @@ def _table(options: argparse.Namespace) -> int:
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
     from osel_sim.ingestion.convert import convert
     from osel_sim.ingestion.readers import read_tables
-    from osel_sim.ingestion.write import Instance, check_out, file_digest, load_image, write_log
+    from osel_sim.ingestion.write import IngestedInstance, check_out, file_digest, load_image, write_log
 
     _refuse(options, ("frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
     start = time.perf_counter()
@@ -139,7 +139,7 @@ def _table(options: argparse.Namespace) -> int:
         for image in source.images:
             load_image(image, source.record.where)  # a broken one is found before an hour of encoding, not after
         instances.append(
-            Instance(
+            IngestedInstance(
                 source.key,
                 source.text,
                 " ".join(file_digest(image) for image in source.images),
@@ -168,7 +168,7 @@ def _action_mse(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
     from osel_sim.episodes.drivers import choose_policies
-    from osel_sim.ingestion.action_mse import Settings, measure, open_datasets
+    from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
 
     start = time.perf_counter()
@@ -181,11 +181,11 @@ def _action_mse(options: argparse.Namespace) -> int:
         if not (camera and equals and column):
             raise UsageError(f"--camera must be CAMERA=COLUMN, got {item!r}")
         cameras[camera] = column
-    settings = Settings(options.frames or 4, 0.05 if options.tolerance is None else options.tolerance, cameras)
+    settings = Measurement(options.frames or 4, 0.05 if options.tolerance is None else options.tolerance, cameras)
     samples = open_datasets(options.dataset, specs, settings)
     instances = [sample.instance for sample in samples]
     inputs = check_out(options.out, instances)
-    rows, source = measure(samples, specs, settings)
+    rows, source = measure_errors(samples, specs, settings)
     # By `metric`, replay and report know that what counts is the score.
     metadata = {"task": "action-mse", "policies": [spec.name for spec in specs], "source": {"metric": "action-mse", **source}}
     texts = [item.text for item in instances]

@@ -77,12 +77,12 @@ def _record(options: argparse.Namespace) -> int:
     from osel_sim.episodes.recording import Recording
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, start_or_resume
+    from osel_sim.formats.run_config import RUN, check_run_folder, content_digests, environment, start_or_resume
     from osel_sim.sim.gl import choose_backend
 
     added_encoder = options.encoder is not None  # one given is added; the encoder that was there must not have changed
     if options.resume and not options.task and options.out is not None:
-        check_folder(options.out, {}, resume=True)
+        check_run_folder(options.out, {}, resume=True)
         _take_settings(options, read_json(options.out / RUN).get("configuration", {}))
     options.repeats, options.repeat_every = options.repeats or 1, options.repeat_every or 1
     tasks = library.select_tasks(options.task, options.tasks)
@@ -121,7 +121,7 @@ def _record(options: argparse.Namespace) -> int:
     }
     before = read_json(folder / RUN) if options.resume and (folder / RUN).exists() else None
     known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
-    check_folder(folder, known, options.resume)
+    check_run_folder(folder, known, options.resume)
     encoder = load_encoder(encoder_name)
     skills = declare(policies, encoder, tasks, options.tasks)
     configuration["encoder"] = encoder.identity

@@ -44,11 +44,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser().parse_args(arguments)
     from osel_sim.analysis.live import is_live_run, read_live
     from osel_sim.analysis.log import read_log
-    from osel_sim.formats.replay_result import check_folder
+    from osel_sim.formats.replay_result import check_replay_folder
 
     selectors = choose_selectors(options.selectors, halved=options.half is not None)
     folder: Path = options.out or Path("runs") / f"replay-{options.log.resolve().name}"
-    check_folder(folder, options.overwrite)
+    check_replay_folder(folder, options.overwrite)
     if not is_live_run(options.log):
         log = read_log(options.log, options.encoder)
         _replay(options, folder, selectors, log, *weights_of(options, log.metadata))
@@ -189,15 +189,15 @@ def _setups(
         others: what costs are known from, and what selectors named `NAME:warm` are shown: the other half, where it is a half that is replayed.
     """
     from osel_sim.analysis.engine import Setup
-    from osel_sim.analysis.warm_start import Beforehand
+    from osel_sim.analysis.warm_start import WarmStart
     from osel_sim.selection.registry import wanted_of
 
     def setup(weights: "RewardWeights") -> Setup:
         known: dict[str, Any] = {} if options.unknown_costs else {COSTS: others.expected_costs(weights)}
         if log.skills is not None and not options.unknown_skills:
             known[SKILLS] = log.skills
-        beforehand = Beforehand(others.contexts, others.rewards(weights)) if options.half else None
-        return Setup(weights, {name: wanted_of(name, known) for name in selectors}, beforehand)
+        warm_start = WarmStart(others.contexts, others.rewards(weights)) if options.half else None
+        return Setup(weights, {name: wanted_of(name, known) for name in selectors}, warm_start)
 
     return setup
 

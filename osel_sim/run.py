@@ -85,7 +85,7 @@ def parser() -> cli.Parser:
 def _run(options: argparse.Namespace) -> int:
     from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.formats.levels import parse_axes, resolve, split_off
-    from osel_sim.formats.run_config import check_folder, environment, start_or_resume
+    from osel_sim.formats.run_config import check_run_folder, environment, start_or_resume
 
     if options.tensorboard:
         from osel_sim.episodes.tensorboard import check_installed
@@ -105,7 +105,7 @@ def _run(options: argparse.Namespace) -> int:
         {label for label in (split_off(resolve(level, axes, task.axes, task.name))[1] for task in tasks for level in options.level) if label}
     )
     configuration = _configuration(options, above, tasks, policies, everyone, weights)
-    check_folder(folder, configuration, options.resume)
+    check_run_folder(folder, configuration, options.resume)
 
     from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
     from osel_sim.sim.gl import choose_backend
@@ -275,11 +275,11 @@ def _log(folder: Path, encoder: str, policies: "list[PolicySpec]") -> "LoggedOut
 
 def _start_warm(live: "LiveRun", log: "LoggedOutcomes", episodes: int, seed: int) -> None:
     """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
-    from osel_sim.analysis.warm_start import Beforehand, show
+    from osel_sim.analysis.warm_start import WarmStart, show
 
     own = live.instance_keys(episodes)
     log = log.take([row for row, key in enumerate(log.keys) if key not in own])
-    count = show(live.selector, Beforehand(log.contexts, log.rewards(live.weights)), live.selector.policies, seed)
+    count = show(live.selector, WarmStart(log.contexts, log.rewards(live.weights)), live.selector.policies, seed)
     print(f"shown beforehand: {count} outcomes of {len(log)} instances of {log.source}, none of them of this run", file=sys.stderr)
 
 

@@ -70,14 +70,14 @@ def _serve(options: argparse.Namespace) -> int:
     spec = library.load_policy(options.policy, options.policies_dir)
     given = os.environ.get(options.token_env)
 
-    from osel_sim.policy.registry import load_policy
+    from osel_sim.policy.registry import session_factory
     from osel_sim.remote.server import PolicyServer, is_loopback, warm_up
 
     if given is None and not is_loopback(options.host):
         raise UsageError(f"--host {options.host} can be reached from other machines: put a token into the environment variable {options.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
     greeting = Greeting.of(spec)
-    make_session = load_policy(spec)
+    make_session = session_factory(spec)
     warm_up(make_session, greeting)
     server = PolicyServer(make_session, greeting, token, options.host, options.port)
 

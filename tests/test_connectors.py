@@ -27,7 +27,7 @@ from osel_sim.formats.mapping import Mapping
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.mapping import actions_of, message_of, orientation, state_of
-from osel_sim.policy.registry import load_policy
+from osel_sim.policy.registry import session_factory
 from osel_sim.remote.policy import open_remote
 
 SIZE = 32
@@ -346,7 +346,7 @@ def test_the_expert_is_only_used_where_it_is_named_and_never_served(tmp_path: Pa
     (spec,) = choose_policies(["scripted_expert"])
     assert spec.is_privileged and not spec.is_remote
     with pytest.raises(UsageError, match="cannot be served"):
-        load_policy(spec)
+        session_factory(spec)
     text = spec.file.read_text()
     (tmp_path / "scripted_expert.toml").write_text(text.replace('"local"', '"remote"'))
     with pytest.raises(ContentError, match="location: must be 'local'"):

@@ -122,7 +122,7 @@ def describe(log: LoggedOutcomes, clustering: Clustering, weights: RewardWeights
 
     Only instances on which every policy has an outcome count: the means of a cluster's policies are then over the same instances.
     """
-    rewards, complete = log.mean_rewards(weights), complete_instances(log, weights)
+    rewards, complete = log.mean_rewards(weights), complete_rows(log, weights)
     clusters = []
     for number in range(clustering.count):
         rows = (clustering.labels == number) & complete
@@ -154,7 +154,7 @@ def inequality(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWe
     Args:
         labels: (N,) cluster of each instance.
     """
-    complete = complete_instances(log, weights)
+    complete = complete_rows(log, weights)
     rewards, own = log.mean_rewards(weights)[complete], labels[complete]
     by_cluster = [(float((own == number).mean()), rewards[own == number].mean(axis=0).max()) for number in np.unique(own)]
     part = log.take(complete)
@@ -180,7 +180,7 @@ def paper_sides(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[np.
     return 1.0 - only_remote, only_remote - float(merged.mean())
 
 
-def complete_instances(log: LoggedOutcomes, weights: RewardWeights) -> NDArray[np.bool_]:
+def complete_rows(log: LoggedOutcomes, weights: RewardWeights) -> NDArray[np.bool_]:
     """Which instances (N,) have a reward of every policy.
 
     Raises:

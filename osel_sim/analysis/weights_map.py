@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.clusters import complete_instances, score_of, time_of
+from osel_sim.analysis.clusters import complete_rows, score_of, time_of
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.outcomes import rates_of
 from osel_sim.core.errors import DataError
@@ -79,11 +79,11 @@ def swept(log: LoggedOutcomes, weights: RewardWeights) -> Swept:
     Raises:
         DataError: no instance has an outcome of every policy at the weights given.
     """
-    rows = complete_instances(log, weights)
+    rows = complete_rows(log, weights)
     axes: list[Axis] = []
     for axis in AXES:
         try:
-            also = rows & complete_instances(log, moved(weights, axis, 1.0))
+            also = rows & complete_rows(log, moved(weights, axis, 1.0))
         except DataError:
             continue
         if also.any():
