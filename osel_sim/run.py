@@ -117,7 +117,6 @@ def _run(options: argparse.Namespace) -> int:
 
     import torch
 
-    from osel_sim.context.cache import ContextCache
     from osel_sim.episodes.drivers import Drivers
     from osel_sim.episodes.live import LiveOptions, LiveRun
     from osel_sim.selection.registry import make_selector
@@ -139,7 +138,7 @@ def _run(options: argparse.Namespace) -> int:
         live_options = LiveOptions(
             options.seed, tuple(options.level), options.split, options.counterfactual, _filmed(options), options.realtime, axes, options.action_noise
         )
-        live = LiveRun(folder, tasks, envs, encoder, ContextCache(folder), drivers, selector, weights, live_options)
+        live = LiveRun(folder, tasks, envs, encoder, drivers, selector, weights, live_options)
         stack.callback(live.close)
         if seen is not None:
             _start_warm(live, seen, options.episodes, options.seed)

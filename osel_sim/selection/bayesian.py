@@ -3,6 +3,7 @@
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,6 +33,37 @@ WARM = 2000
 """Of more warm contexts than these, evenly spaced ones are taken."""
 
 
+@dataclass(frozen=True)
+class Prior:
+    """What a `BayesianSelector` is told before its first decision, and how it explores.
+
+    Attributes:
+        signals: candidates for the prior variance of w relative to the noise, > 0.
+        optimism, chance: weights of the two ways to explore, >= 0.
+        expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
+            learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
+        warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
+        skills: what policies are said to be able to do, as a first guess of their success; None: nothing is said.
+
+    Raises:
+        UsageError: a number out of range.
+    """
+
+    signals: Sequence[float]
+    optimism: float = 0.0
+    chance: float = 0.0
+    expected_costs: Mapping[str, float] | None = None
+    warm_contexts: ArrayLike | None = None
+    skills: Skills | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("optimism", self.optimism), ("chance", self.chance)):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise UsageError(f"{name} must be finite and >= 0, got {value}")
+        if not self.signals or not all(math.isfinite(signal) and signal > 0.0 for signal in self.signals):
+            raise UsageError(f"signals must be one or more finite numbers > 0, got {list(self.signals)}")
+
+
 class BayesianSelector(SelectorBase):
     """Regresses reward plus declared cost on features of the context and chooses by mean, uncertainty and chance.
 
@@ -49,53 +81,31 @@ class BayesianSelector(SelectorBase):
     Args:
         policies, context_dim, seed: see `SelectorBase`.
         features: fresh ones, of this selector alone.
-        signals: candidates for the prior variance of w relative to the noise, > 0.
-        optimism, chance: see above, >= 0.
-        expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
-            learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
-        skills: what policies are said to be able to do, as a first guess of their success; None: nothing is said.
-        warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
+        prior: what it is told.
 
     Raises:
-        UsageError: a number out of range, or contexts of another form.
+        UsageError: contexts of another form.
         UnknownNameError: `expected_costs` lacks a policy.
     """
 
     off_policy: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        policies: Sequence[str],
-        context_dim: int,
-        seed: int,
-        features: Features,
-        *,
-        signals: Sequence[float],
-        optimism: float,
-        chance: float,
-        expected_costs: Mapping[str, float] | None,
-        warm_contexts: ArrayLike | None,
-        skills: Skills | None = None,
-    ) -> None:
+    def __init__(self, policies: Sequence[str], context_dim: int, seed: int, features: Features, prior: Prior) -> None:
         super().__init__(policies, context_dim, seed)
-        if skills is not None and skills.dimension != context_dim:
-            raise UsageError(f"the examples of skills have length {skills.dimension}, contexts {context_dim}")
-        self._skills = skills
-        for name, value in (("optimism", optimism), ("chance", chance)):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UsageError(f"{name} must be finite and >= 0, got {value}")
-        if not signals or not all(math.isfinite(signal) and signal > 0.0 for signal in signals):
-            raise UsageError(f"signals must be one or more finite numbers > 0, got {list(signals)}")
-        self._costs_declared = None if expected_costs is None else {name: float(cost) for name, cost in expected_costs.items()}
+        self._skills = prior.skills
+        if self._skills is not None and self._skills.dimension != context_dim:
+            raise UsageError(f"the examples of skills have length {self._skills.dimension}, contexts {context_dim}")
+        costs = prior.expected_costs
+        self._costs_declared = None if costs is None else {name: float(cost) for name, cost in costs.items()}
         self._costs = np.array([self._cost(name) for name in self.policies])
-        self._signals = [float(signal) for signal in signals]
-        self.optimism, self.chance = float(optimism), float(chance)
+        self._signals = [float(signal) for signal in prior.signals]
+        self.optimism, self.chance = float(prior.optimism), float(prior.chance)
         self._sketch = Sketch(context_dim)
-        self._warm, self._warm_digest = self._check_warm(warm_contexts)
+        self._warm, self._warm_digest = self._check_warm(prior.warm_contexts)
         self._features = features
         self._generator = np.random.default_rng(seed)
         self._contexts: list[NDArray[np.float32]] = []
-        self._head_count = 1 if skills is None else 2
+        self._head_count = 1 if self._skills is None else 2
         self._heads: list[Array] = []
         self._chosen: list[int] = []
         self._targets: list[float] = []

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from osel_sim.core.errors import UsageError
 from osel_sim.core.torch_settings import threads
 from osel_sim.interface.selector import State
-from osel_sim.selection.bayesian import BayesianSelector
+from osel_sim.selection.bayesian import BayesianSelector, Prior
 from osel_sim.selection.features import Array, Components
 
 STEPS, RATE, DECAY = 150, 0.02, 1e-3
@@ -25,7 +25,7 @@ class NeuralLinearSelector(BayesianSelector):
         policies, context_dim, seed: see `SelectorBase`.
         components: principal components of the contexts seen, whitened: the network's input.
         hidden: units of the hidden layer.
-        chance, signals, expected_costs, warm_contexts: see `BayesianSelector`.
+        chance, signals, expected_costs, warm_contexts: see `Prior`.
 
     Raises:
         UsageError: a number out of range, or contexts of another form.
@@ -51,17 +51,8 @@ class NeuralLinearSelector(BayesianSelector):
             raise UsageError(f"components and hidden must be at least 1, got {components} and {hidden}")
         self._own = {"components": components, "hidden": hidden}
         self._hidden = HiddenLayer(components, hidden)
-        super().__init__(
-            policies,
-            context_dim,
-            seed,
-            self._hidden,
-            signals=signals,
-            optimism=0.0,
-            chance=chance,
-            expected_costs=expected_costs,
-            warm_contexts=warm_contexts,
-        )
+        prior = Prior(signals, chance=chance, expected_costs=expected_costs, warm_contexts=warm_contexts)
+        super().__init__(policies, context_dim, seed, self._hidden, prior)
 
     @property
     def settings(self) -> dict[str, Any]:
