@@ -66,14 +66,14 @@ def _serve(config: ServeConfig) -> int:
     spec = library.load_policy(config.policy, config.policies_dir)
     given = os.environ.get(config.token_env)
 
-    from osel_sim.policy.registry import load_policy
+    from osel_sim.policy.registry import session_factory
     from osel_sim.remote.server import PolicyServer, is_loopback, warm_up
 
     if given is None and not is_loopback(config.host):
         raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
     greeting = Greeting.of(spec)
-    make_session = load_policy(spec)
+    make_session = session_factory(spec)
     warm_up(make_session, greeting)
     server = PolicyServer(make_session, greeting, token, config.host, config.port)
 

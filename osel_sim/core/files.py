@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import os
 import tomllib
 from pathlib import Path
@@ -24,6 +25,15 @@ def write_json(file: Path, data: dict[str, Any]) -> None:
     partial = file.with_suffix(".partial")
     partial.write_text(json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
     os.replace(partial, file)
+
+
+def finite(data: Any) -> Any:
+    """Plain data with None instead of numbers that JSON does not have (NaN and infinities)."""
+    if isinstance(data, dict):
+        return {key: finite(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [finite(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
 def read_json(file: Path) -> dict[str, Any]:

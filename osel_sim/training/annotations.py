@@ -109,7 +109,7 @@ def load_annotations(folder: Path, columns: dict[str, NDArray[Any]]) -> Annotati
     if not side.is_file() or any(name not in columns for name in (POSITIONS, PRESENT, TARGET)):
         return None
     try:
-        data = read_json(side)
+        data = read_dataset_json(side)
         entities = tuple(Nameable(str(item["name"]), str(item["role"]), tuple(map(str, item["names"]))) for item in data["entities"])
         attributes = tuple(Nameable(str(item["name"]), ATTRIBUTE, tuple(map(str, item["names"]))) for item in data.get("attributes", []))
         roles = {str(role): str(kind) for role, kind in data.get("roles", LEGACY_ROLES).items()}
@@ -147,7 +147,7 @@ def load_annotations(folder: Path, columns: dict[str, NDArray[Any]]) -> Annotati
     )
 
 
-def read_json(file: Path) -> dict[str, Any]:
+def read_dataset_json(file: Path) -> dict[str, Any]:
     """A dataset's JSON object.
 
     Raises:

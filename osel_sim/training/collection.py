@@ -12,7 +12,7 @@ from pathlib import Path
 from osel_sim.core.errors import UsageError
 from osel_sim.core.processes import end_with_parent
 from osel_sim.formats.task_file import TaskSpec
-from osel_sim.training.annotations import SIDE_FILE, read_json
+from osel_sim.training.annotations import SIDE_FILE, read_dataset_json
 
 SHARD = 20
 
@@ -25,7 +25,7 @@ def shards_folder(out: Path) -> Path:
 def seeds(out: Path) -> int | None:
     """How many seeds the dataset is of, or None where there is none."""
     side = out / "meta" / SIDE_FILE
-    return read_json(side).get("seeds") if side.is_file() else None
+    return read_dataset_json(side).get("seeds") if side.is_file() else None
 
 
 def check_settings(folder: Path, settings: dict[str, object]) -> None:

@@ -20,7 +20,7 @@ from tqdm import tqdm  # type: ignore[import-untyped]
 
 from osel_sim.core.errors import DataError
 from osel_sim.interface.policy import ACTION_DIM, STATE_DIM
-from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations, read_json
+from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations, read_dataset_json
 
 IMAGES = "observation.images."
 INFO = "meta/info.json"
@@ -63,7 +63,7 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
     Raises:
         DataError: not such a dataset, or a camera, the state or the action missing or of another shape.
     """
-    info = read_json(folder / "meta" / "info.json")
+    info = read_dataset_json(folder / "meta" / "info.json")
     features = info.get("features", {})
     for name, shape in {"observation.state": [STATE_DIM], "action": [ACTION_DIM]}.items():
         if features.get(name, {}).get("shape") != shape:
@@ -103,7 +103,7 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
 def task_of(folder: Path) -> str | None:
     """The task that a dataset's side file says its demonstrations are of, or None."""
     side = folder / "meta" / SIDE_FILE
-    task = read_json(side).get("task") if side.is_file() else None
+    task = read_dataset_json(side).get("task") if side.is_file() else None
     return task if isinstance(task, str) else None
 
 
