@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from osel_sim import cli
 from osel_sim.cli.reward_flags import add_reward_flags, weights_of
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.shown import shown
 
 if TYPE_CHECKING:
     from osel_sim.analysis.engine import Setup
@@ -121,8 +122,8 @@ def _replay(
         print(f"warning: {left_out.instances} instances without an outcome of every policy are left out", file=sys.stderr)
     if log.skills is None and log.metadata.get(DECLARED) and not options.unknown_skills:
         print(
-            f"warning: auto is not told what policies were made for: {log.source} lacks examples of it in the contexts of {log.encoder}; "
-            f"python -m osel_sim.record --resume --out {log.source} --encoder {log.encoder.partition('@')[0]} adds them",
+            f"warning: auto is not told what policies were made for: {log.source} lacks examples of it in the contexts of {shown(log.encoder)}; "
+            f"python -m osel_sim.record --resume --out {log.source} --encoder {shown(log.encoder.partition('@')[0])} adds them",
             file=sys.stderr,
         )
     setup = _setups(log, others, selectors, options)

@@ -12,6 +12,7 @@ from osel_sim import cli
 from osel_sim.cli.reward_flags import add_reward_flags, weights_of
 from osel_sim.core import content
 from osel_sim.core.errors import OselError, UnknownNameError
+from osel_sim.core.shown import shown
 from osel_sim.formats import library
 
 if TYPE_CHECKING:
@@ -214,7 +215,7 @@ def _report(live: "LiveRun", selector: str) -> None:
     learning_curve(live.folder / "curve.png", f"{_title(live.tasks)}, {len(chosen)} decisions", selector, policies, chosen, live.rewards)
     console().print(run_table(summary))
     for decision in [decision for decision in live.decisions if decision.error][:3]:
-        print(f"error in episode {decision.index}: {decision.error}", file=sys.stderr)
+        print(f"error in episode {decision.index}: {shown(decision.error or '')}", file=sys.stderr)
     try:
         write_page(run_page(live.folder), live.folder)
     except OselError as problem:  # the run itself is complete; python -m osel_sim.report tries again

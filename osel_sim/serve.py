@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from osel_sim import cli
 from osel_sim.core.errors import OselError, UsageError
+from osel_sim.core.shown import shown
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
 if TYPE_CHECKING:
@@ -35,7 +36,9 @@ One line of JSON on standard output says when it is ready. GET /healthz needs no
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
     options = _parser().parse_args(arguments)
-    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING)
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Formatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
     if options.watch_stdin:
         threading.Thread(target=_stop_with_stdin, daemon=True).start()
     try:
@@ -45,6 +48,11 @@ def main(arguments: list[str] | None = None) -> int:
         return error.exit_code
     except KeyboardInterrupt:
         return 130
+
+
+class _Formatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return shown(super().format(record))  # clients have a say in it
 
 
 def _parser() -> argparse.ArgumentParser:

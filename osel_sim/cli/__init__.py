@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from osel_sim.core.errors import OselError, UsageError, did_you_mean
+from osel_sim.core.shown import shown
 from osel_sim.core.trust import VARIABLE, trust
 
 USAGE = 2
@@ -147,5 +148,5 @@ def _integer(text: str, least: int) -> int:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    print(f"error: {shown(message)}", file=sys.stderr)
     return code

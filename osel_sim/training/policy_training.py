@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core import content
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.shown import shown
 from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.training.batches import Batches, frames_of, statistics_of
@@ -158,7 +159,7 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
                 task = _task(one)
                 by_task[one.name]["success_rate"] = success_rate(spec, options.out, task, options.rollouts, options.seed, options.tasks)
         for task, result in by_task.items():
-            print(f"{task}: " + "  ".join(f"{name} {value:.4g}" for name, value in result.items()), file=sys.stderr)
+            print(f"{shown(task)}: " + "  ".join(f"{name} {value:.4g}" for name, value in result.items()), file=sys.stderr)
         validations.append({"step": step, **(next(iter(by_task.values())) if len(data) == 1 else {"tasks": by_task, **_means(by_task)})})
         write_json(options.out / "training.json", record(step))
 
