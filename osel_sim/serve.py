@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
 from osel_sim.cli.command import Command
 from osel_sim.core.errors import SettingError, UsageError
+from osel_sim.core.shown import shown
 from osel_sim.core.trust import trusting
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
@@ -51,7 +52,9 @@ class ServeConfig(TrustSettings):
 
 
 def _execute(config: ServeConfig) -> int:
-    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING)
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Formatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
     if config.watch_stdin:
         threading.Thread(target=_stop_with_stdin, daemon=True).start()
     with trusting(config.trust):
@@ -84,6 +87,11 @@ def _serve(config: ServeConfig) -> int:
 
     _run_until_signal(server, ready)
     return 0
+
+
+class _Formatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return shown(super().format(record))  # clients have a say in it
 
 
 def _run_until_signal(server: "PolicyServer", ready: Callable[[int], None]) -> None:

@@ -3,11 +3,16 @@
 import difflib
 from collections.abc import Iterable
 
+from osel_sim.core.shown import shown
+
 
 class OselError(Exception):
-    """Base of all errors this package raises on purpose."""
+    """Base of all errors this package raises on purpose. Its text may quote what others wrote, and holds neither control characters nor secrets."""
 
     exit_code = 2
+
+    def __str__(self) -> str:
+        return shown(super().__str__())
 
 
 class UsageError(OselError):

@@ -16,6 +16,7 @@ from torch import nn
 
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import finite, write_json
+from osel_sim.core.shown import shown
 from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.training.batches import Batches, statistics_of
@@ -159,7 +160,7 @@ class PolicyTraining:
                 task = _task(one)
                 by_task[one.name]["success_rate"] = success_rate(self._spec, options.out, task, options.rollouts, options.seed, options.tasks)
         for task, result in by_task.items():
-            print(f"{task}: " + "  ".join(f"{name} {value:.4g}" for name, value in result.items()), file=sys.stderr)
+            print(f"{shown(task)}: " + "  ".join(f"{name} {value:.4g}" for name, value in result.items()), file=sys.stderr)
         self._validations.append({"step": step, **(next(iter(by_task.values())) if len(data) == 1 else {"tasks": by_task, **_means(by_task)})})
         write_json(options.out / "training.json", finite(self._record(step)))
 
