@@ -112,7 +112,7 @@ network = "none"
 def test_no_command_tells_the_secrets_of_an_address(address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.toml").write_text(POLICY.replace("{}", address))
     own = ["--policies-dir", str(tmp_path)]
-    assert run_main(["--list", *own]) == 0 and run.main(["--list", "--json", *own]) == 0
+    assert run_main(["--list", *own]) == 0 and run_main(["--list", "--json", *own]) == 0
     doctor.main(own)
     output = capsys.readouterr()
     assert "127.0.0.1:9" in output.out and SECRET not in output.out + output.err
