@@ -143,6 +143,9 @@ def _record(options: argparse.Namespace) -> int:
                 (folder / RUN).unlink() if before is None else write_json(folder / RUN, before)
             raise
         recording.finish(configuration)
+        if lost := recording.lost:
+            first = f"{lost[0].instance}, policy {lost[0].policy}: {lost[0].error}"
+            print(f"warning: {len(lost)} episodes were lost, the first of them of {first}; --resume --out {folder} records them again", file=sys.stderr)
     _print_summary(folder)
     return 0
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from pool_helpers import Dying, die, refuse, squares
 from remote_helpers import alive
+from run_helpers import children, wait_until
 
 from osel_sim.core.errors import UnknownNameError, WorkerError
 from osel_sim.core.processes import Lost, Result, run_jobs
@@ -68,7 +69,7 @@ def test_three_lossy_jobs_in_a_row_are_the_end(tmp_path):
 
 
 def test_an_error_of_the_first_setup_is_the_callers():
-    with pytest.raises(UnknownNameError, match="did you mean 'thing'?"):
+    with pytest.raises(UnknownNameError, match="did you mean 'thing'"):
         list(run_jobs(refuse, ["a"], 2))
 
 
@@ -104,17 +105,6 @@ def start_script(folder: Path, **more) -> subprocess.Popen:
     (folder / "script.py").write_text(SCRIPT)
     arguments = [sys.executable, str(folder / "script.py"), str(Path(__file__).parent)]
     return subprocess.Popen(arguments, env={**os.environ, "STARTED": str(folder / "started")}, stderr=subprocess.PIPE, text=True, **more)
-
-
-def children(process: subprocess.Popen) -> set[int]:
-    return set(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
-
-
-def wait_until(condition, seconds: float) -> bool:
-    end = time.monotonic() + seconds
-    while not (met := condition()) and time.monotonic() < end:
-        time.sleep(0.005)
-    return bool(met)
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.03, 0.1, 0.2, None])

@@ -11,7 +11,7 @@ import json
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -60,7 +60,7 @@ class Lost[J]:
 
 def run_jobs[J, R](
     setup: Setup[J, R], jobs: Sequence[J], workers: int, results: Callable[[J], int] = lambda job: 1
-) -> Iterator[Result[J, R] | Lost[J]]:
+) -> Generator[Result[J, R] | Lost[J], None, None]:
     """Work on jobs in worker processes. What comes of them does not depend on how many there are, only the order does.
 
     A result whose worker died is tried once more, at once. Close the iterator to end all workers; they also end when this process does.
