@@ -2,7 +2,6 @@
 
 import argparse
 import contextlib
-import os
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 from osel_sim import cli
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
+from osel_sim.core.files import write_bytes
 from osel_sim.formats.levels import AXES, LEVELS
 
 if TYPE_CHECKING:
@@ -46,10 +46,8 @@ def main(arguments: list[str] | None = None) -> int:
 
     import cv2
 
-    partial = options.out.with_name(f".{options.out.name}.partial")
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    partial.write_bytes(cv2.imencode(".png", picture[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())
-    os.replace(partial, options.out)
+    write_bytes(options.out, cv2.imencode(".png", picture[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())
     print(f"{options.out}: {picture.shape[1]} x {picture.shape[0]} pixels")
     return 0
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from osel_sim import cli
 from osel_sim.core.errors import UsageError
+from osel_sim.core.files import file_digest
 from osel_sim.ingestion.mapping import VALUES
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ def _table(options: argparse.Namespace) -> int:
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
     from osel_sim.ingestion.convert import convert
     from osel_sim.ingestion.readers import read_tables
-    from osel_sim.ingestion.write import Instance, check_out, file_digest, load_image, write_log
+    from osel_sim.ingestion.write import Instance, check_out, load_image, write_log
 
     _refuse(options, ("frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
     start = time.perf_counter()

@@ -144,8 +144,8 @@ def _record(options: argparse.Namespace) -> int:
             raise
         recording.finish(configuration)
         if lost := recording.lost:
-            first = f"{lost[0].instance}, policy {lost[0].policy}: {lost[0].error}"
-            print(f"warning: {len(lost)} episodes were lost, the first of them of {first}; --resume --out {folder} records them again", file=sys.stderr)
+            first = f"the first of them of {lost[0].instance}, policy {lost[0].policy} ({lost[0].error})"
+            print(f"warning: {len(lost)} episodes were lost, {first}; --resume --out {folder} records them again", file=sys.stderr)
     _print_summary(folder)
     return 0
 
@@ -193,8 +193,7 @@ def _as_it_began(configuration: dict[str, Any], before: dict[str, Any]) -> dict[
 
 def _record_missing(recording: "Recording", workers: int) -> None:
     """Record what is not there yet, with a progress bar, and add it."""
-    from tqdm import tqdm  # type: ignore[import-untyped]
-
+    from osel_sim.core.progress import progress
     from osel_sim.episodes.workers import record
 
     plan, missing = recording.plan, recording.missing()
@@ -202,7 +201,7 @@ def _record_missing(recording: "Recording", workers: int) -> None:
     unit = "episode" if left else "context"
     start = time.perf_counter()
     done = successes = 0
-    with tqdm(total=total if left else len(missing), initial=total - left if left else 0, unit=unit, dynamic_ncols=True) as bar:
+    with progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar:
         for recorded in record(plan if left else replace(plan, everyone=()), missing, workers):  # contexts alone need no policy
             if recorded is None:
                 bar.update()
@@ -213,7 +212,7 @@ def _record_missing(recording: "Recording", workers: int) -> None:
                 continue
             done += len(rows)
             successes += sum(row.success for row in rows)
-            bar.set_postfix_str(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h", refresh=False)
+            bar.note(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h")
     if done:
         seconds = time.perf_counter() - start
         print(f"{done} episodes in {seconds:.0f} s with {workers} workers: {3600 * done / seconds:.0f} episodes an hour, starting up included")

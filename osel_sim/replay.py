@@ -95,8 +95,6 @@ def _replay(
     off_policy: "dict[str, Any] | None" = None,
 ) -> None:
     """Replay, write and print."""
-    from tqdm import tqdm  # type: ignore[import-untyped]
-
     from osel_sim.analysis.engine import replay
     from osel_sim.analysis.frontier import selector_frontiers
     from osel_sim.analysis.oracles import oracles
@@ -104,6 +102,7 @@ def _replay(
     from osel_sim.analysis.streams import complete_instances
     from osel_sim.cli.console import console
     from osel_sim.cli.replay_tables import print_replay
+    from osel_sim.core.progress import progress
     from osel_sim.formats.replay_result import write_replay
     from osel_sim.formats.rollout_log import DECLARED
     from osel_sim.selection.skills import Skills
@@ -130,7 +129,7 @@ def _replay(
     told = here.settings.values()
     best = oracles(log, weights)
     decisions = len(log) if options.decisions is None else options.decisions
-    with tqdm(total=len(selectors) * options.seeds * decisions, unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
+    with progress(len(selectors) * options.seeds * decisions, "decision", scale=True) as bar:
         (chosen,) = replay(log, [here], selectors, range(options.seeds), options.decisions, options.workers, bar.update)
     choices = with_fixed(chosen, best)
     result = build(log, weights, preset, choices, best, left_out, range(options.seeds))
@@ -144,18 +143,12 @@ def _replay(
     learners = [name for name in selectors if name != "random"]
     if options.no_frontier or not learners:
         return
-    with tqdm(desc="at other weights", unit="decision", unit_scale=True, dynamic_ncols=True) as bar:
-
-        def show(made: int, total: int) -> None:
-            bar.total = total
-            bar.update(made - bar.n)
-
-        try:
-            result["frontier"] = selector_frontiers(log, setup, weights, learners, options.seeds, options.decisions, options.workers, show)
-        except DataError as error:
-            bar.close()
-            print(f"warning: no frontier of selectors: {error}", file=sys.stderr)
-            return
+    try:
+        with progress(None, "decision", "at other weights", scale=True) as bar:
+            result["frontier"] = selector_frontiers(log, setup, weights, learners, options.seeds, options.decisions, options.workers, bar.at)
+    except DataError as error:
+        print(f"warning: no frontier of selectors: {error}", file=sys.stderr)
+        return
     write_replay(folder, result, choices, tables(result))
 
 

@@ -157,7 +157,7 @@ def _run(options: argparse.Namespace) -> int:
 
 def _decide_all(live: "LiveRun", episodes: int, board: "TensorBoard | None") -> bool:
     """Make all decisions, with a progress bar. Returns whether Ctrl-C ended it: the decision at hand is finished first."""
-    from tqdm import tqdm  # type: ignore[import-untyped]
+    from osel_sim.core.progress import progress
 
     interrupted = False
 
@@ -169,12 +169,12 @@ def _decide_all(live: "LiveRun", episodes: int, board: "TensorBoard | None") -> 
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:
-        with tqdm(total=episodes, initial=len(live.decisions), unit="episode", dynamic_ncols=True) as bar:
+        with progress(episodes, "episode", initial=len(live.decisions)) as bar:
             while len(live.decisions) < episodes and not interrupted:
                 live.decide()
                 if board is not None:
                     board.update(live)
-                bar.set_postfix_str(_progress(live), refresh=False)
+                bar.note(_progress(live))
                 bar.update()
     finally:
         signal.signal(signal.SIGINT, before)

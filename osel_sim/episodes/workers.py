@@ -1,7 +1,7 @@
 """Recording episodes in worker processes: each has its own simulator, policies and servers, and may die without taking the others' work along.
 
-A worker gets one instance at a time and gives back its context, then one row an episode. An episode that killed its worker is tried once more; if that
-dies as well, it becomes an error row, and a new worker does the rest of the instance.
+A worker gets one instance at a time and gives back its context, then one row an episode. An episode whose worker died is tried once more; if that
+worker dies as well, it becomes an error row, and a new worker does the rest of the instance.
 """
 
 import functools
