@@ -17,6 +17,8 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+import cloudpickle  # type: ignore[import-untyped]
+
 from osel_sim.core.errors import WorkerError
 from osel_sim.core.worker import Raised, Ready, Value
 
@@ -77,8 +79,6 @@ def run_jobs[J, R](
         Exception: `setup` raised it before any worker was ready.
         WorkerError: three jobs in a row lost a result, or no worker starts.
     """
-    import cloudpickle  # type: ignore[import-untyped]
-
     pool = _Pool[J, R](cloudpickle.dumps(setup), [_Task(job, results(job)) for job in jobs], workers)
     try:
         yield from pool.work()
@@ -216,8 +216,6 @@ class _Pool[J, R]:
 
     def _staff(self) -> None:
         """Give work to workers that have none, and start as many of those that are not there as what is left can use."""
-        import cloudpickle
-
         for worker in self._workers:
             if self._todo and worker.ready and worker.task is None and worker.connection is not None:
                 worker.task = task = self._todo.popleft()
