@@ -82,4 +82,3 @@ def closed(world: "World", thing: str) -> bool:
 def pressed(world: "World", thing: str) -> bool:
     """The button is down."""
     return world.opening(thing) > PRESSED
-
