@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from synthetic_demonstrations import STEPS, write
 
-from osel_sim import ingest
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.episodes.loop import Driver
 from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.ingest import main as ingest_main
 from osel_sim.ingestion.action_mse import Settings, action_mse, measure_one, open_datasets
 from osel_sim.policy.local import LocalCaller
 
@@ -81,7 +81,7 @@ def test_who_knows_the_answer_has_no_error_and_a_crash_is_no_score(dataset):
 def test_shipped_policies_are_measured(dataset, tmp_path):
     out = tmp_path / "log"
     command = ["--metric", "action-mse", "--dataset", dataset, "--policies", "local_small", "remote_large", "--frames", 2, "--tolerance", 0.3]
-    assert ingest.main([str(item) for item in [*command, "--out", out]]) == 0
+    assert ingest_main([str(item) for item in [*command, "--out", out]]) == 0
     rows, metadata = read_rollouts(out)
     assert [row.policy for row in rows] == ["local_small", "remote_large"] * 2 * EPISODES
     assert all(row.error is None and row.score is not None and -4 < row.score < 0 for row in rows)
@@ -109,8 +109,8 @@ def test_bad_datasets_get_one_line(dataset, tmp_path, capsys):
     with pytest.raises(DataError, match="one_eye: cannot be read as a LeRobotDataset"):
         open_datasets([other], [library.load_policy("local_small")], Settings())
     flags = ["--metric", "action-mse", "--dataset", str(dataset), "--policies", "local_small", "--out", str(tmp_path / "log")]
-    assert ingest.main([*flags, "--camera", "wrist"]) == 2
-    assert ingest.main([*flags, "--camera", "wrist=observation.images.wrist"]) == 2
+    assert ingest_main([*flags, "--camera", "wrist"]) == 2
+    assert ingest_main([*flags, "--camera", "wrist=observation.images.wrist"]) == 2
     error = capsys.readouterr().err
     assert "--camera must be CAMERA=COLUMN, got 'wrist'" in error
     assert "--camera wrist: no policy has that camera" in error

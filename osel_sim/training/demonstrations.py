@@ -6,11 +6,8 @@ LeRobotDataset that was not finalised cannot be read.
 
 import functools
 import json
-import logging
-import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,12 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.core.errors import WorkerError
-from osel_sim.core.files import atomic_folder, read_json, write_text
-from osel_sim.core.processes import Lost, Work, run_jobs
+from osel_sim.core.files import read_json, write_text
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM
-from osel_sim.training.annotations import SIDE_FILE
 
 CAMERAS = ("agentview", "wrist")
 BURST_PROBABILITY = 0.04
@@ -89,49 +83,6 @@ def side_file(task: TaskSpec, levels: tuple[int, ...], axes: Mapping[str, int], 
         "roles": dict(task.roles),
         "phrasings": {"train": list(task.train)},
     }
-
-
-def record_shards(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shard, int, list[int]]]:
-    """Record shards in worker processes, unless they are there already: each with its number of frames and the seeds that the expert failed on.
-
-    Raises:
-        WorkerError: a worker died twice on a shard; after the others have been recorded.
-        Exception: what a shard raised, such as OSError where the disk is full.
-    """
-    lost: list[Lost[Shard]] = []
-    with closing(run_jobs(_recorder, shards, workers)) as events:
-        for event in events:
-            if isinstance(event, Lost):
-                if event.error is not None:
-                    raise event.error
-                lost.append(event)
-            else:
-                frames, _, failed = event.value
-                yield event.job, frames, failed
-    if lost:
-        raise WorkerError(f"{len(lost)} shards were lost with their worker processes, the first of them {lost[0].job} ({lost[0].cause})")
-
-
-def _recorder() -> Work[Shard, tuple[int, int, list[int]]]:
-    """What a worker does. Workers share the cores: one thread each, for numpy, torch and Mesa's rasteriser. The progress bar is the parent's."""
-    os.environ.update(OMP_NUM_THREADS="1", LP_NUM_THREADS="1", HF_DATASETS_DISABLE_PROGRESS_BARS="1")
-    quiet_lerobot()
-    return lambda shard, _: [record_shard(shard)]
-
-
-def quiet_lerobot() -> None:
-    """LeRobot warns, in every process, that it cannot decode videos the usual way; the images are PNG."""
-    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
-
-
-def join_shards(task: TaskSpec, out: Path, folders: list[Path], side: dict[str, Any]) -> None:
-    """Make one dataset out of shards, with a side file, put in place only when it is whole."""
-    from lerobot.datasets.aggregate import aggregate_datasets
-
-    with atomic_folder(out) as partial:
-        name = f"osel_sim/{task.name}"
-        aggregate_datasets([name] * len(folders), name, roots=folders, aggr_root=partial, concatenate_data=False)
-        (partial / "meta" / SIDE_FILE).write_text(json.dumps(side, indent=1))
 
 
 def record_shard(shard: Shard) -> tuple[int, int, list[int]]:

@@ -3,25 +3,18 @@
 import json
 import math
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from osel_sim import cli
 from osel_sim.context.encoder import DEFAULT_ENCODER, WEIGHTS
-from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.errors import CheckpointError, UsageError
 from osel_sim.core.torch_settings import computes_bfloat16
-from osel_sim.formats.levels import LEVELS
 from osel_sim.formats.library import select_tasks
 
 STATE = "training_state.pt"
 REPORT = "training.json"
 SAVE_SECONDS = 60.0
-EXAMPLES = """examples:
-  python -m osel_sim.train --encoder osel_small --data data/scenes
-  python -m osel_sim.train --encoder osel_small --data data/scenes --task all --level 0 1 2 --steps 3000 --out runs/train/osel_small
-"""
 
 
 @dataclass(frozen=True)
@@ -46,40 +39,6 @@ class Settings:
     views: int = 64
     texts: int = 64
     rate: float = 1e-3
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Train an encoder from the command line, measure it, and write its open_clip folder."""
-    defaults = Settings()
-    parser = cli.Parser("train", "Train the context encoder on rendered scenes and their instructions, and measure it on unseen ones.", EXAMPLES)
-    parser.add_argument(
-        "--encoder", metavar="NAME", nargs="?", const=DEFAULT_ENCODER, required=True, help=f"architecture: {DEFAULT_ENCODER}, the only one so far"
-    )
-    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="rendered scenes are kept here, and rendered if missing")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="the checkpoint's folder (default: DATA/<encoder>); load it with --encoder DIR")
-    parser.add_argument("--task", nargs="+", default=list(defaults.tasks), help="names, tag:TAG, or all (default: pick_place)")
-    parser.add_argument("--level", nargs="+", type=int, choices=LEVELS, default=[0], help="levels of the scenes, in turn (default: 0)")
-    length = parser.add_mutually_exclusive_group()
-    length.add_argument("--steps", type=int, default=defaults.steps, help="gradient steps (default: %(default)s)")
-    length.add_argument("--minutes", type=float, help="as many steps as fit, timed on the first ones")
-    parser.add_argument("--scenes", type=int, default=defaults.scenes, help="training scenes of each task (default: %(default)s)")
-    parser.add_argument("--test-scenes", type=int, default=defaults.test_scenes, help="test scenes of each task to measure on (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=defaults.seed)
-    parser.add_argument("--device", default="", help="torch device (default: cuda if there, else cpu)")
-    parser.add_argument("--resume", action="store_true", help="go on from the last saved state in the checkpoint's folder, to --steps")
-    options = parser.parse_args(arguments)
-    if options.encoder != DEFAULT_ENCODER:
-        raise UnknownNameError("encoder to train", options.encoder, [DEFAULT_ENCODER])
-    for name in ("steps", "scenes", "test_scenes"):
-        if getattr(options, name) < 1:
-            raise UsageError(f"--{name.replace('_', '-')} must be 1 or more, got {getattr(options, name)}")
-    if options.minutes is not None and not options.minutes > 0:
-        raise UsageError(f"--minutes must be more than 0, got {options.minutes}")
-    tasks = tuple(task.name for task in select_tasks(options.task))
-    settings = Settings(tasks, tuple(options.level), options.steps, options.seed, options.scenes, options.test_scenes)
-    report = train(settings, options.data, options.out or options.data / options.encoder, options.minutes, options.device, options.resume)
-    print(json.dumps(report["measured"], indent=2))
-    return 0
 
 
 def train(settings: Settings, data: Path, out: Path, minutes: float | None = None, device: str = "", resume: bool = False) -> dict[str, Any]:
