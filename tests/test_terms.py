@@ -106,6 +106,6 @@ def test_without_the_package_the_task_is_refused(installed, monkeypatch):
 def test_reading_task_files_imports_no_simulator():
     code = (
         "import sys\nfrom osel_sim.formats import library\nlibrary.select_tasks(['all'])\n"
-        "print({'mujoco', 'robosuite', 'torch', 'numba', 'scipy'} & set(sys.modules))"
+        "print({'mujoco', 'robosuite', 'torch', 'numba', 'numpy'} & set(sys.modules))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"

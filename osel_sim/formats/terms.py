@@ -44,7 +44,7 @@ predicates = Registry(
     {"in": "osel_sim.sim.predicates:inside"} | {name: f"osel_sim.sim.predicates:{name}" for name in _PREDICATES},
     Predicate,
 )
-skills = Registry("skill", "osel_sim.skills", {name: f"osel_sim.sim.expert:Skills.{name}" for name in _SKILLS}, Skill)
+skills = Registry("skill", "osel_sim.skills", {name: f"osel_sim.sim.skills:{name}" for name in _SKILLS}, Skill)
 PREDICATES: Mapping[str, Signature] = Signatures(predicates)
 SKILLS: Mapping[str, Signature] = Signatures(skills)
 

@@ -6,8 +6,7 @@ Every skill is a function of the state alone, not of time, so that what it does 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.formats.terms import HINGED, KINDS, RECEPTACLES, skills
-from osel_sim.interface.terms import Skill
+from osel_sim.formats.terms import skills
 from osel_sim.sim import predicates
 from osel_sim.sim.scene import TABLE_HEIGHT
 from osel_sim.sim.world import World
@@ -195,7 +194,8 @@ class Expert:
                 return stage + 1 if test(self, *(roles[role] for role in plan[stage].roles)) else None
         return None
 
-    def _put(self, thing: str, place: str) -> bool:
+    def has_put(self, thing: str, place: str) -> bool:
+        """Whether the thing is where it goes, and let go."""
         is_object = self.world.task.entity(place).kind == "object"
         return not self._touched(thing) and (predicates.on if is_object else predicates.inside)(self.world, thing, place)
 
@@ -300,17 +300,3 @@ class Expert:
         action[3:6] = 0.5 * ROTATION_GAIN * np.array([error[1, 2], error[2, 0], error[0, 1]])
         action[6] = gripper
         return action
-
-
-class Skills:
-    """The skills that plans of task files can name."""
-
-    reach = Skill((KINDS,), Expert.reach)
-    grasp = Skill((KINDS,), Expert.grasp)
-    lift = Skill((("object",),), Expert.lift)
-    move = Skill((("object",), (*RECEPTACLES, "object")), Expert.move)
-    place = Skill((("object",), (*RECEPTACLES, "object")), Expert.place, achieved=Expert._put)
-    push = Skill((("object",), ("zone",)), Expert.push, achieved=Expert._put)
-    open = Skill((HINGED,), Expert.open, achieved=lambda expert, thing: predicates.opened(expert.world, thing))
-    close = Skill((HINGED,), Expert.close, achieved=lambda expert, thing: predicates.closed(expert.world, thing))
-    press = Skill((("button",),), Expert.press, achieved=lambda expert, thing: predicates.pressed(expert.world, thing))
