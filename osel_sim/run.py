@@ -6,6 +6,7 @@ from typing import Any
 
 from osel_sim.api.run import RunConfig
 from osel_sim.cli.command import INTERRUPTED, Command
+from osel_sim.core.shown import shown
 
 EXAMPLES = """examples:
   python -m osel_sim.run --list                                            # tasks and policies there are
@@ -29,7 +30,7 @@ def _execute(config: RunConfig) -> int:
     if result.journal:
         console().print(run_table(dict(result.summary)))
         for decision in [decision for decision in result.journal if decision.error][:3]:
-            print(f"error in episode {decision.index}: {decision.error}", file=sys.stderr)
+            print(f"error in episode {decision.index}: {shown(decision.error or '')}", file=sys.stderr)
         print(f"written to {result.folder}" + ("; report.html shows it" if result.page else ""))
     return INTERRUPTED if result.interrupted else 0
 

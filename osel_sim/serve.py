@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
 from osel_sim.cli.command import Command
 from osel_sim.core.errors import SettingError, UsageError
+from osel_sim.core.shown import shown
 from osel_sim.core.trust import trusting
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
@@ -51,7 +52,9 @@ class ServeConfig(TrustSettings):
 
 
 def _execute(config: ServeConfig) -> int:
-    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING)
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Formatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
     if config.watch_stdin:
         threading.Thread(target=_stop_with_stdin, daemon=True).start()
     with trusting(config.trust):
@@ -66,14 +69,14 @@ def _serve(config: ServeConfig) -> int:
     spec = library.load_policy(config.policy, config.policies_dir)
     given = os.environ.get(config.token_env)
 
-    from osel_sim.policy.registry import load_policy
+    from osel_sim.policy.registry import session_factory
     from osel_sim.remote.server import PolicyServer, is_loopback, warm_up
 
     if given is None and not is_loopback(config.host):
         raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
     greeting = Greeting.of(spec)
-    make_session = load_policy(spec)
+    make_session = session_factory(spec)
     warm_up(make_session, greeting)
     server = PolicyServer(make_session, greeting, token, config.host, config.port)
 
@@ -84,6 +87,11 @@ def _serve(config: ServeConfig) -> int:
 
     _run_until_signal(server, ready)
     return 0
+
+
+class _Formatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return shown(super().format(record))  # clients have a say in it
 
 
 def _run_until_signal(server: "PolicyServer", ready: Callable[[int], None]) -> None:

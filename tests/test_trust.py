@@ -71,11 +71,12 @@ def test_no_command_runs_it(folder: Path, tmp_path: Path, capsys: pytest.Capture
     insert(folder, popen(marker))
     text = library.load_policy("local_small").file.read_text()
     (tmp_path / "mine.toml").write_text(text.replace('"local_small"', '"mine"').replace('"assets/policies/local_small"', f'"{folder}"'))
-    from osel_sim import doctor, run, serve
+    from osel_sim import doctor, serve
+    from osel_sim.run import main as run_main
 
     own = ["--policies-dir", str(tmp_path)]
     assert (
-        run.main([*own, "--task", "lift", "--policies", "mine", "--selector", "fixed:mine", "--episodes", "1", "--out", str(tmp_path / "out")]) == 2
+        run_main([*own, "--task", "lift", "--policies", "mine", "--selector", "fixed:mine", "--episodes", "1", "--out", str(tmp_path / "out")]) == 2
     )
     assert doctor.main([*own, "--policy", "mine", "--task", "lift"]) == 2
     assert serve.main([*own, "mine", "--port", "0"]) == 2

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.streams import Streams, draw_streams
-from osel_sim.analysis.warm_start import Beforehand, show
+from osel_sim.analysis.warm_start import WarmStart, show
 from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
@@ -36,12 +36,12 @@ class Setup:
     Attributes:
         weights: of the reward.
         settings: selector -> keyword arguments, where they are not to be the defaults.
-        beforehand: of other instances than the log's; needed for selectors named `NAME:warm`.
+        warm_start: of other instances than the log's; needed for selectors named `NAME:warm`.
     """
 
     weights: RewardWeights
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    beforehand: Beforehand | None = None
+    warm_start: WarmStart | None = None
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def replay(
 
     Args:
         log: complete instances only (`osel_sim.analysis.streams.complete_instances`).
-        selectors: names, as `osel_sim.selection.registry.make_selector` takes them; `NAME:warm` for one that is shown what is known `beforehand`.
+        selectors: names, as `osel_sim.selection.registry.make_selector` takes them; `NAME:warm` for one that is shown the `warm_start` first.
         seeds: of the streams, and of the selectors.
         decisions: length of a stream; None: all instances.
         workers: processes; with 1 it happens in this one.
@@ -86,8 +86,8 @@ def replay(
         UsageError: a selector is to start warm and there is nothing to show it.
     """
     warm = [name for name in selectors if name.endswith(WARM)]
-    if warm and any(setup.beforehand is None for setup in setups):
-        raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to show beforehand")
+    if warm and any(setup.warm_start is None for setup in setups):
+        raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to start warm with")
     tables = tuple(log.rewards(setup.weights) for setup in setups)
     streams = tuple(draw_streams(table, seeds, decisions) for table in tables)
     material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams)
@@ -108,7 +108,7 @@ def replay_one(
     rewards: NDArray[np.float64],
     policies: Sequence[str],
     seed: int,
-    beforehand: Beforehand | None = None,
+    warm_start: WarmStart | None = None,
     factory: Factory | None = None,
     **settings: Any,
 ) -> NDArray[np.int8]:
@@ -116,7 +116,7 @@ def replay_one(
 
     Args:
         contexts: (T, D). rewards: (T, P).
-        beforehand: shown first, in an order of the seed's.
+        warm_start: shown first, in an order of the seed's.
         factory: makes the selector; None: the registry does.
         settings: of the selector.
 
@@ -129,8 +129,8 @@ def replay_one(
 
     size = contexts.shape[1]
     selector = make_selector(name, policies, size, seed, **settings) if factory is None else factory(policies, size, seed)
-    if beforehand is not None:
-        show(selector, beforehand, policies, seed)
+    if warm_start is not None:
+        show(selector, warm_start, policies, seed)
     if isinstance(selector, PPOSelector) and supports(selector):
         return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
     column = {policy: index for index, policy in enumerate(policies)}
@@ -177,7 +177,7 @@ def _replay_job(material: _Material, job: _Job, factory: Factory | None = None) 
     rewards = streams.rewards(material.rewards[at], number)
     contexts = material.contexts[streams.order[number]]
     contexts.flags.writeable = False
-    kind, shown = name.removesuffix(WARM), setup.beforehand if name.endswith(WARM) else None
+    kind, shown = name.removesuffix(WARM), setup.warm_start if name.endswith(WARM) else None
     return job, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, factory, **setup.settings.get(name, {}))
 
 

@@ -160,7 +160,7 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.core.files import file_digest
     from osel_sim.ingestion.convert import convert
     from osel_sim.ingestion.readers import read_tables
-    from osel_sim.ingestion.write import Instance, check_out, load_image, write_log
+    from osel_sim.ingestion.write import IngestedInstance, check_out, load_image, write_log
 
     start = time.perf_counter()
     mapping = _mapping(config, out)
@@ -171,7 +171,7 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
         for image in source.images:
             load_image(image, source.record.where)  # a broken one is found before an hour of encoding, not after
         instances.append(
-            Instance(
+            IngestedInstance(
                 source.key,
                 source.text,
                 " ".join(file_digest(image) for image in source.images),
@@ -199,8 +199,7 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.context.encoder import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
     from osel_sim.episodes.drivers import choose_policies
-    from osel_sim.ingestion.action_mse import Settings as Measured
-    from osel_sim.ingestion.action_mse import measure, open_datasets
+    from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
 
     start = time.perf_counter()
@@ -213,11 +212,11 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
         if not (camera and equals and column):
             raise SettingError("camera", f"must be CAMERA=COLUMN, got {item!r}")
         cameras[camera] = column
-    measured = Measured(config.frames or 4, 0.05 if config.tolerance is None else config.tolerance, cameras)
+    measured = Measurement(config.frames or 4, 0.05 if config.tolerance is None else config.tolerance, cameras)
     samples = open_datasets(config.dataset, specs, measured)
     instances = [sample.instance for sample in samples]
     inputs = check_out(out, instances)
-    rows, source = measure(samples, specs, measured)
+    rows, source = measure_errors(samples, specs, measured)
     # By `metric`, replay and report know that what counts is the score.
     metadata = {"task": "action-mse", "policies": [spec.name for spec in specs], "source": {"metric": "action-mse", **source}}
     texts = [item.text for item in instances]

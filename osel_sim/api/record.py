@@ -74,14 +74,14 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
     from osel_sim.core.files import read_json, write_json
     from osel_sim.episodes.declared_skills import declare
     from osel_sim.episodes.recording import Recording
-    from osel_sim.formats.run_config import RUN, check_folder, environment, start_or_resume
+    from osel_sim.formats.run_config import RUN, check_run_folder, environment, start_or_resume
     from osel_sim.sim.gl import choose_backend
 
     plan = _plan(config)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
     before = read_json(folder / RUN) if config.resume and (folder / RUN).exists() else None
     known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
-    check_folder(folder, known, config.resume)
+    check_run_folder(folder, known, config.resume)
     encoder = load_encoder(plan.encoder)
     skills = declare(plan.policies, encoder, plan.tasks, config.tasks)
     configuration["encoder"] = encoder.identity
@@ -155,10 +155,10 @@ def _configuration(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
 def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
     """The settings that a recording began with; policies, repeats and an encoder that were given come in addition."""
     from osel_sim.core.files import read_json
-    from osel_sim.formats.run_config import RUN, check_folder
+    from osel_sim.formats.run_config import RUN, check_run_folder
 
     folder = cast(Path, config.out)
-    check_folder(folder, {}, resume=True)
+    check_run_folder(folder, {}, resume=True)
     began = read_json(folder / RUN).get("configuration", {})
     try:
         values = {name: began[key] for name, key in _FIXED.items()}

@@ -107,12 +107,12 @@ class _Replay:
         """Do it."""
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
-        from osel_sim.formats.replay_result import check_folder, write_off_policy
+        from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
 
         config, folder = self.config, self.config.folder
         named = None if config.selectors is None else [name for name in config.selectors if name not in self.factories]
         selectors = [*choose_selectors(named, halved=config.half is not None), *self.factories]
-        check_folder(folder, config.overwrite)
+        check_replay_folder(folder, config.overwrite)
         if not is_live_run(config.log):
             log = read_log(config.log, config.encoder)
             return self._replay(selectors, log, *weights_of(config, log.metadata))
@@ -197,7 +197,7 @@ class _Replay:
     def _setups(self, log: "LoggedOutcomes", others: "LoggedOutcomes", selectors: Sequence[str]) -> "Callable[[RewardWeights], Setup]":
         """Under what to replay at any weights: what selectors are told, and shown before their stream begins."""
         from osel_sim.analysis.engine import Setup
-        from osel_sim.analysis.warm_start import Beforehand
+        from osel_sim.analysis.warm_start import WarmStart
         from osel_sim.selection.registry import wanted_of
 
         config = self.config
@@ -206,8 +206,8 @@ class _Replay:
             known: dict[str, Any] = {} if config.unknown_costs else {COSTS: others.expected_costs(weights)}
             if log.skills is not None and not config.unknown_skills:
                 known[SKILLS] = log.skills
-            beforehand = Beforehand(others.contexts, others.rewards(weights)) if config.half else None
-            return Setup(weights, {name: wanted_of(name, known) for name in selectors if name not in self.factories}, beforehand)
+            warm_start = WarmStart(others.contexts, others.rewards(weights)) if config.half else None
+            return Setup(weights, {name: wanted_of(name, known) for name in selectors if name not in self.factories}, warm_start)
 
         return setup
 

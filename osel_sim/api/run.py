@@ -157,12 +157,12 @@ class _Run:
         """Do it."""
         from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
         from osel_sim.core import content
-        from osel_sim.formats.run_config import check_folder, environment, start_or_resume
+        from osel_sim.formats.run_config import check_run_folder, environment, start_or_resume
         from osel_sim.sim.gl import choose_backend
 
         config, folder = self.config, self.config.folder
         configuration = self._configuration()
-        check_folder(folder, configuration, config.resume)
+        check_run_folder(folder, configuration, config.resume)
         encoder = load_encoder(config.encoder or DEFAULT_ENCODER)
         configuration["encoder"] = encoder.identity
         seen = self._log(config.warm_start, encoder.identity) if config.warm_start else None
@@ -248,22 +248,21 @@ class _Run:
         return read_log(folder, encoder).only([spec.name for spec in self.policies])
 
     def _live(self, folder: Path, envs: Any, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
-        from osel_sim.context.cache import ContextCache
         from osel_sim.episodes.live import LiveOptions, LiveRun
 
         config = self.config
         options = LiveOptions(
             config.seed, tuple(config.level), config.split, config.counterfactual, config.filmed, config.realtime, self.axes, config.action_noise
         )
-        return LiveRun(folder, self.tasks, envs, encoder, ContextCache(folder), drivers, selector, self.weights, options)
+        return LiveRun(folder, self.tasks, envs, encoder, drivers, selector, self.weights, options)
 
     def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
-        from osel_sim.analysis.warm_start import Beforehand, show
+        from osel_sim.analysis.warm_start import WarmStart, show
 
         own = live.instance_keys(self.config.episodes)
         log = log.take([row for row, key in enumerate(log.keys) if key not in own])
-        count = show(live.selector, Beforehand(log.contexts, log.rewards(live.weights)), live.selector.policies, self.config.seed)
+        count = show(live.selector, WarmStart(log.contexts, log.rewards(live.weights)), live.selector.policies, self.config.seed)
         logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
 
     def _decide_all(self, live: "LiveRun", stack: contextlib.ExitStack) -> bool:

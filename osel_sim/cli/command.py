@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 from osel_sim.api.settings import MAIN, OTHER, Group, Settings
 from osel_sim.cli.output import show_log
 from osel_sim.core.errors import OselError, SettingError, UnknownNameError, UsageError, did_you_mean
+from osel_sim.core.shown import shown
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -282,5 +283,5 @@ def _one_line(error: Exception) -> str:
 
 
 def _complain(message: str, code: int) -> int:
-    print(f"error: {message}", file=sys.stderr)
+    print(f"error: {shown(message)}", file=sys.stderr)
     return code

@@ -12,6 +12,7 @@ from pathlib import Path
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError, DataError, DisplayError
 from osel_sim.core.files import read_json
+from osel_sim.core.shown import shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
 
@@ -163,7 +164,7 @@ def _policies(folder: Path | None) -> Iterator[Check]:
 def _checkpoint(policy: PolicySpec) -> Check:
     """Whether a policy's checkpoint is on this machine, and whole."""
     if policy.remote is not None and policy.remote.url is not None:
-        return Check("policies", policy.name, f"served at {policy.remote.url} (not tried)", NOTE)
+        return Check("policies", policy.name, f"served at {shown(policy.remote.url)} (not tried)", NOTE)
     if not policy.checkpoint:
         return Check("policies", policy.name, f"{policy.kind}, needs no checkpoint")
     place = content.resolve_checkpoint(policy.checkpoint)

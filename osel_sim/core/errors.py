@@ -4,15 +4,20 @@ import difflib
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from osel_sim.core.shown import shown
+
 
 class OselError(Exception):
-    """Base of all errors this package raises on purpose."""
+    """Base of all errors this package raises on purpose. Its text may quote what others wrote, and holds neither control characters nor secrets."""
 
     exit_code = 2
 
     def __reduce__(self) -> tuple[Callable[..., "OselError"], tuple[Any, ...]]:
         # By default an exception is made again from its message alone, which those with arguments of their own do not take.
         return _restore, (type(self), self.args, self.__dict__)
+
+    def __str__(self) -> str:
+        return shown(super().__str__())
 
 
 class UsageError(OselError):

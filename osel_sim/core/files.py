@@ -3,6 +3,7 @@
 import contextlib
 import hashlib
 import json
+import math
 import os
 import shutil
 import tomllib
@@ -89,13 +90,22 @@ def write_text(file: Path, text: str) -> None:
     write_bytes(file, text.encode())
 
 
-def write_json(file: Path, data: dict[str, Any], *, allow_nan: bool = False) -> None:
+def write_json(file: Path, data: dict[str, Any]) -> None:
     """Write indented JSON, at once or not at all.
 
     Raises:
-        ValueError: a NaN or infinity, which JSON does not have, unless `allow_nan`.
+        ValueError: a NaN or infinity, which JSON does not have; `finite` makes None of them.
     """
-    write_text(file, json.dumps(data, indent=2, allow_nan=allow_nan, ensure_ascii=False) + "\n")
+    write_text(file, json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+
+
+def finite(data: Any) -> Any:
+    """Plain data with None instead of numbers that JSON does not have (NaN and infinities)."""
+    if isinstance(data, dict):
+        return {key: finite(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [finite(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
 def read_json(file: Path, hint: str = "") -> dict[str, Any]:

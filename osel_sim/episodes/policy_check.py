@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
-from osel_sim.core.files import write_json
+from osel_sim.core.files import finite, write_json
 from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
 from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
@@ -151,7 +151,7 @@ def check_policy(spec: PolicySpec, task: str, seed: int, level: int, out: Path, 
         report.pictures = _pictures(spec, [observation for observation, _ in watched.seen], out)
     _actions(report, [call.actions for _, call in watched.seen if call.actions is not None], other.answer)
     _end(report, outcome)
-    write_json(out / "report.json", asdict(report), allow_nan=True)
+    write_json(out / "report.json", finite(asdict(report)))
     return report
 
 

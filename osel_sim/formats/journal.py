@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim.core.errors import DataError
+from osel_sim.core.shown import escaped
 from osel_sim.interface.outcome import Outcome, Seconds
 
 
@@ -67,7 +68,7 @@ def to_line(data: dict[str, Any]) -> str:
     Raises:
         ValueError: a NaN or infinity, which JSON does not have.
     """
-    return json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(", ", ": ")) + "\n"
+    return escaped(json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(", ", ": "))) + "\n"
 
 
 class Lines:

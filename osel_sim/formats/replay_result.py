@@ -56,7 +56,7 @@ class Choices:
         return np.asarray(np.take_along_axis(self.outcomes(table), chosen, axis=2)[:, :, 0], np.float64)
 
 
-def check_folder(folder: Path, overwrite: bool) -> None:
+def check_replay_folder(folder: Path, overwrite: bool) -> None:
     """Refuse an output folder that cannot be used, before any work is done.
 
     Raises:

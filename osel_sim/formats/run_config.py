@@ -65,7 +65,7 @@ def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -
     return digests
 
 
-def check_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:
+def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:
     """Refuse an output folder that cannot be used, before anything heavy is loaded.
 
     Args:
@@ -118,10 +118,10 @@ def start_or_resume(
         warnings: what is different in the environment of a resumed run.
 
     Raises:
-        UsageError: as `check_folder`, or the folder cannot be written, or the GL backend differs.
+        UsageError: as `check_run_folder`, or the folder cannot be written, or the GL backend differs.
         DataError: its `run.json` cannot be read.
     """
-    check_folder(folder, configuration, resume)
+    check_run_folder(folder, configuration, resume)
     file = folder / RUN
     if not resume:
         try:

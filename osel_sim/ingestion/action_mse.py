@@ -19,7 +19,7 @@ from osel_sim.core.files import content_digest, file_digest
 from osel_sim.episodes.loop import Driver, episode_seed
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
-from osel_sim.ingestion.write import Instance
+from osel_sim.ingestion.write import IngestedInstance
 from osel_sim.interface.encoder import Image
 from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
 
@@ -28,7 +28,7 @@ STATE, ACTION = "observation.state", "action"
 
 
 @dataclass(frozen=True)
-class Settings:
+class Measurement:
     """What is measured.
 
     Attributes:
@@ -53,7 +53,7 @@ class Dataset:
         DataError: it is none, or lacks a camera, the state or the actions of the suite's form.
     """
 
-    def __init__(self, folder: Path, cameras: Sequence[str], settings: Settings) -> None:
+    def __init__(self, folder: Path, cameras: Sequence[str], settings: Measurement) -> None:
         self.folder, self._settings, self._cameras = folder, settings, cameras
         info = folder / "meta" / "info.json"
         if not info.is_file():
@@ -112,13 +112,13 @@ class Sample:
         frame, end: index of the frame, and of the one after its episode's last.
     """
 
-    instance: Instance
+    instance: IngestedInstance
     dataset: Dataset
     frame: int
     end: int
 
 
-def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings: Settings) -> list[Sample]:
+def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings: Measurement) -> list[Sample]:
     """The frames that policies are to be measured on: `settings.frames` of each episode of each dataset.
 
     Raises:
@@ -140,12 +140,12 @@ def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings
             chosen = np.unique(np.linspace(start, end, settings.frames, endpoint=False).astype(int))
             for frame in map(int, chosen):
                 key = f"{name}/{episode:06d}/{frame - start:06d}"
-                instance = Instance(key, dataset.instruction(frame), digest, partial(dataset.images, frame))
+                instance = IngestedInstance(key, dataset.instruction(frame), digest, partial(dataset.images, frame))
                 samples.append(Sample(instance, dataset, frame, end))
     return samples
 
 
-def measure(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Settings) -> tuple[list[Row], dict[str, Any]]:
+def measure_errors(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Measurement) -> tuple[list[Row], dict[str, Any]]:
     """Ask every policy for its actions on every sample.
 
     Returns:

@@ -18,7 +18,7 @@ AUTOSAVE = 500
 
 
 @dataclass(frozen=True)
-class Instance:
+class IngestedInstance:
     """What an instance's context is made from.
 
     Attributes:
@@ -32,7 +32,7 @@ class Instance:
     images: Callable[[], Sequence[Image]]
 
 
-def check_out(folder: Path, instances: Iterable[Instance]) -> str:
+def check_out(folder: Path, instances: Iterable[IngestedInstance]) -> str:
     """Refuse an output folder that holds something else, before anything heavy is loaded.
 
     Returns:
@@ -54,7 +54,7 @@ def check_out(folder: Path, instances: Iterable[Instance]) -> str:
 
 
 def write_log(
-    folder: Path, inputs: str, rows: list[Row], instances: Sequence[Instance], load_encoder: Callable[[], Encoder], metadata: dict[str, Any]
+    folder: Path, inputs: str, rows: list[Row], instances: Sequence[IngestedInstance], load_encoder: Callable[[], Encoder], metadata: dict[str, Any]
 ) -> str:
     """Encode what is not encoded yet, with a progress bar, and write the log. An interrupted one goes on where it was.
 

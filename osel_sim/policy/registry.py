@@ -23,7 +23,7 @@ def kinds() -> list[str]:
     return sorted({*LOADERS, *SERVERS, *PRIVILEGED})
 
 
-def load_policy(spec: PolicySpec) -> MakeSession:
+def session_factory(spec: PolicySpec) -> MakeSession:
     """Load the weights of `spec` and return the factory of its sessions.
 
     Raises:
@@ -35,8 +35,8 @@ def load_policy(spec: PolicySpec) -> MakeSession:
 
 
 def make_policy(spec: PolicySpec) -> Policy:
-    """One policy of `spec`, weights included. Use `load_policy` where several sessions share them."""
-    return load_policy(spec)()
+    """One policy of `spec`, weights included. Use `session_factory` where several sessions share them."""
+    return session_factory(spec)()
 
 
 def _loader(spec: PolicySpec) -> Loader:

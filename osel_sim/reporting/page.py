@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from osel_sim.core.errors import UsageError
 from osel_sim.core.files import write_bytes
+from osel_sim.core.shown import all_shown, shown
 from osel_sim.reporting.description import DARK, LIGHT, Figure, Table
 from osel_sim.reporting.html_tables import to_csv, to_text
 
@@ -122,7 +123,7 @@ def to_html(page: Page) -> str:
     from osel_sim.reporting.plotly_figures import to_plotly
 
     template = resources.files("osel_sim.reporting") / "template"
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalize)
     data = {
         "palette": {"light": LIGHT, "dark": DARK},
         "figures": {figure.name: to_plotly(figure) for figure in page.figures},
@@ -151,7 +152,12 @@ def _plotly() -> str:
     return (Path(found.origin).parent / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
 
 
+def _finalize(value: Any) -> Any:
+    """What the template puts in: texts as they may be shown; style, script and data are the page's own."""
+    return shown(value) if type(value) is str else value
+
+
 def _embedded(data: Mapping[str, Any]) -> str:
-    """JSON that cannot end the script element it stands in, whatever is in it."""
-    text = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    """JSON that cannot end the script element it stands in, whatever is in it; its texts as they may be shown."""
+    text = json.dumps(all_shown(data), allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

@@ -252,7 +252,10 @@ class Expert:
         return self.towards(np.array([*behind, height]), 0.0, CLOSED)
 
     def _lean(self, thing: str) -> Array:
-        """Rotation (3, 3) by which a gripper that holds the thing leans away from what its handle is fixed to."""
+        """Rotation (3, 3) by which a gripper that holds the thing leans away from what its handle is fixed to.
+
+        Rodrigues' formula: scipy's Rotation differs in the last bits, and with them the episodes of the expert would.
+        """
         angle = np.radians(self.world.task.entity(thing).lean)
         if not angle:
             return np.eye(3)

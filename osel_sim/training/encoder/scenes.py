@@ -61,7 +61,7 @@ class Scenes:
             raise DataError(f"{file}: not a file of scenes ({' '.join(str(error).split())}); remove it to render them again") from None
 
 
-def render_scenes(task: TaskSpec, seeds: Iterable[int], split: str, size: int, levels: Sequence[int] = (0,)) -> Scenes:
+def render_instances(task: TaskSpec, seeds: Iterable[int], split: str, size: int, levels: Sequence[int] = (0,)) -> Scenes:
     """Load each instance into the simulator and take its picture; seeds go through `levels` in turn."""
     from osel_sim.sim.env import TaskEnv
     from osel_sim.sim.instance import make_instance
@@ -94,5 +94,5 @@ def cached_scenes(folder: Path, task: TaskSpec, count: int, split: str, size: in
     turned_up = "" if tuple(levels) == (0,) else "_level" + "".join(map(str, levels))
     file = folder / f"scenes_{task.name}_{split}_{count}_{size}px{turned_up}.npz"
     if not file.is_file():
-        render_scenes(task, range(count), split, size, levels).save(file)
+        render_instances(task, range(count), split, size, levels).save(file)
     return Scenes.load(file)
