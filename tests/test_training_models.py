@@ -21,7 +21,7 @@ from osel_sim.training.batches import Batches, frames_of, statistics_of
 from osel_sim.training.dataset import load_demonstrations
 from osel_sim.training.instructions import Instructions
 from osel_sim.training.policy_training import Options, train
-from osel_sim.training.projection import places_in_view
+from osel_sim.training.projection import Pinhole
 from osel_sim.training.recipe import Augmentation, Recipe, find_recipe, load_recipe
 from osel_sim.training.source import Wanted
 
@@ -229,12 +229,12 @@ def test_roles_that_nothing_fills_and_properties_have_no_place(tmp_path: Path) -
         load_annotations(folder, columns)
 
 
-def test_places_of_a_frame_are_those_of_the_camera_as_it_is_then(demonstrations: Path) -> None:
+def test_places_of_points_in_a_camera(demonstrations: Path) -> None:
     """The flat world's camera sees columns grow with x and rows with y."""
     pose = json.loads((demonstrations / "meta" / "osel_sim.json").read_text())["cameras"]["agentview"]
     points = np.array([[0.2, -0.1, 0.8], [9.0, 0.0, 0.8]], np.float32)
-    found = places_in_view(pose, points, world.state_of(np.zeros(3), 0.0))
-    assert found[:2] == pytest.approx([0.5, -0.25]) and found[2:].tolist() == [2.0, 2.0]
+    seen, hidden = Pinhole.from_dict(pose).places(points[None], world.state_of(np.zeros(3), 0.0)[None])[0]
+    assert seen == pytest.approx([0.5, -0.25]) and np.isnan(hidden).all()
 
 
 def test_recipes_of_all_types_and_what_they_refuse(tmp_path: Path) -> None:
