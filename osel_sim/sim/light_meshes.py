@@ -13,6 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.arrays import read_arrays
+from osel_sim.core.errors import DataError
+
 KEEP = 0.04
 """Fraction of faces kept."""
 FEWEST = 250
@@ -136,7 +139,6 @@ def _save(file: Path, light: dict[str, NDArray[Any]]) -> None:
 
 def _load(file: Path) -> dict[str, NDArray[Any]] | None:
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            return dict(archive)
-    except (OSError, ValueError, EOFError):  # missing, or torn by a crash: make it anew
+        return read_arrays(file, "meshes")
+    except DataError:  # missing, or torn by a crash: make it anew
         return None
