@@ -1,7 +1,6 @@
 """A contact sheet of every task at every level: `python -m osel_sim.gallery --out sheet.png`."""
 
 import contextlib
-import os
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from osel_sim.api.settings import CONTENT, MAIN, Count, Folder, Index, Names, Se
 from osel_sim.cli.command import Command
 from osel_sim.core import content
 from osel_sim.core.errors import SettingError
+from osel_sim.core.files import write_bytes
 from osel_sim.formats.levels import AXES, LEVELS
 
 if TYPE_CHECKING:
@@ -63,10 +63,8 @@ def _execute(config: GalleryConfig) -> int:
 
     import cv2
 
-    partial = config.out.with_name(f".{config.out.name}.partial")
     config.out.parent.mkdir(parents=True, exist_ok=True)
-    partial.write_bytes(cv2.imencode(".png", picture[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())
-    os.replace(partial, config.out)
+    write_bytes(config.out, cv2.imencode(".png", picture[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())
     print(f"{config.out}: {picture.shape[1]} x {picture.shape[0]} pixels")
     return 0
 

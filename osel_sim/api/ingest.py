@@ -157,9 +157,10 @@ def _refuse(config: IngestConfig, names: Sequence[str], with_what: str) -> None:
 def _table(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.context.encoder import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
+    from osel_sim.core.files import file_digest
     from osel_sim.ingestion.convert import convert
     from osel_sim.ingestion.readers import read_tables
-    from osel_sim.ingestion.write import IngestedInstance, check_out, file_digest, load_image, write_log
+    from osel_sim.ingestion.write import IngestedInstance, check_out, load_image, write_log
 
     start = time.perf_counter()
     mapping = _mapping(config, out)

@@ -102,6 +102,11 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
             (folder / RUN).unlink() if before is None else write_json(folder / RUN, before)
         raise
     recording.finish(configuration)
+    if lost := recording.lost:
+        logger.warning(
+            "%d episodes were lost, the first of them of %s, policy %s (%s); --resume --out %s records them again",
+            *(len(lost), lost[0].instance, lost[0].policy, lost[0].error, folder),
+        )
     return RecordResult(folder, done, seconds)
 
 
@@ -192,8 +197,7 @@ def _as_it_began(configuration: Mapping[str, Any], before: Mapping[str, Any]) ->
 
 def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
     """Record what is not there yet, with a progress bar, and add it. Returns how many episodes, and the seconds they took."""
-    from tqdm.auto import tqdm  # type: ignore[import-untyped]
-
+    from osel_sim.core.progress import progress
     from osel_sim.episodes.workers import record as record_episodes
 
     plan, missing = recording.plan, recording.missing()
@@ -201,7 +205,7 @@ def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
     unit = "episode" if left else "context"
     start = time.perf_counter()
     done = successes = 0
-    with tqdm(total=total if left else len(missing), initial=total - left if left else 0, unit=unit, dynamic_ncols=True) as bar:
+    with progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar:
         for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers):  # contexts alone need no policy
             if recorded is None:
                 bar.update()
@@ -212,5 +216,5 @@ def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
                 continue
             done += len(rows)
             successes += sum(row.success for row in rows)
-            bar.set_postfix_str(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h", refresh=False)
+            bar.note(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h")
     return done, time.perf_counter() - start

@@ -267,7 +267,7 @@ class _Run:
 
     def _decide_all(self, live: "LiveRun", stack: contextlib.ExitStack) -> bool:
         """Make all decisions, with a progress bar. Returns whether Ctrl-C ended it: the decision at hand is finished first."""
-        from tqdm.auto import tqdm  # type: ignore[import-untyped]
+        from osel_sim.core.progress import progress
 
         board = None
         if self.config.tensorboard:
@@ -276,12 +276,12 @@ class _Run:
             board = stack.enter_context(TensorBoard(live.folder))
             board.update(live)
         total = self.config.episodes
-        with _Interrupt() as interrupt, tqdm(total=total, initial=len(live.decisions), unit="episode", dynamic_ncols=True) as bar:
+        with _Interrupt() as interrupt, progress(total, "episode", initial=len(live.decisions)) as bar:
             while len(live.decisions) < total and not interrupt.asked:
                 live.decide()
                 if board is not None:
                     board.update(live)
-                bar.set_postfix_str(_progress(live), refresh=False)
+                bar.note(_progress(live))
                 bar.update()
         return interrupt.asked
 

@@ -1,7 +1,6 @@
 """What `doctor` looks at: Python, packages, display, machine, tasks, policies and the encoder."""
 
 import importlib.metadata
-import json
 import os
 import platform
 import shutil
@@ -11,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from osel_sim.core import content
-from osel_sim.core.errors import ContentError, DisplayError
+from osel_sim.core.errors import ContentError, DataError, DisplayError
+from osel_sim.core.files import read_json
 from osel_sim.core.shown import shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
@@ -192,8 +192,8 @@ def _weights(area: str, name: str, folder: Path, fix: str, config: str = CONFIG)
     from safetensors import SafetensorError, safe_open
 
     try:
-        json.loads((folder / config).read_bytes())
-    except (OSError, ValueError):
+        read_json(folder / config)
+    except DataError:
         return Check(area, name, f"{config} in {folder} is missing or no JSON", MISSING, fix)
     # Processors keep their statistics in safetensors files of their own.
     files = sorted(file for file in folder.glob("*.safetensors") if "processor" not in file.name)

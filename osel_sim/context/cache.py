@@ -1,6 +1,5 @@
 """Contexts on disk: `contexts.npz` beside a journal or rollout log, keyed by encoder and instance."""
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from osel_sim.core.arrays import read_arrays
 from osel_sim.core.errors import DataError, UsageError
+from osel_sim.core.files import atomic
 from osel_sim.interface.encoder import Context, Encoder, Image
 
 FILE = "contexts.npz"
@@ -106,12 +106,8 @@ class ContextCache:
             arrays[f"{encoder}|instances"] = np.array(instances, dtype=np.str_)
             arrays[f"{encoder}|contexts"] = np.stack([known[instance] for instance in instances])
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.file.with_suffix(".tmp")
-        with temporary.open("wb") as handle:
+        with atomic(self.file, sync=True) as partial, partial.open("wb") as handle:
             np.savez(handle, allow_pickle=False, **arrays)
-            handle.flush()
-            os.fsync(handle.fileno())
-        temporary.replace(self.file)
         self._unsaved = 0
 
     def _identity(self, encoder: str) -> str:

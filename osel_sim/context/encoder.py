@@ -1,14 +1,12 @@
 """What a selector sees of an instance: its image(s) and instruction as one vector of fixed length."""
 
 import gzip
-import hashlib
 import logging
 import textwrap
 import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.content import root
-from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError, nearest
+from osel_sim.core.files import file_digest
 from osel_sim.core.hub import offline_if_unreachable
+from osel_sim.core.registry import Registry
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
 from osel_sim.interface.encoder import Context, Encoder, Image
 
@@ -26,7 +26,8 @@ WEIGHTS = "open_clip_model.safetensors"
 CONFIG = "open_clip_config.json"
 VOCABULARY = "bpe_vocabulary.txt.gz"
 MAX_VOCABULARY = 16 << 20  # bytes, inflated; CLIP's own has 3 MB
-ENTRY_POINTS = "osel_sim.encoders"
+PLUGINS = Registry[Callable[[], Encoder]]("encoder", "osel_sim.encoders", {})
+"""Encoders of other packages."""
 
 
 def embedded_encoders() -> dict[str, Path]:
@@ -49,10 +50,8 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
         UnknownNameError: no such encoder, model or tag; names the nearest.
         CheckpointError: weights cannot be downloaded, read, do not fit the model, or ask for code.
     """
-    for plugin in entry_points(group=ENTRY_POINTS):
-        if plugin.name == name:
-            encoder: Encoder = plugin.load()()
-            return encoder
+    if name in PLUGINS and name not in embedded_encoders():
+        return PLUGINS.load(name)()
     if "sentence:" in name or name.endswith("tfidf"):
         from osel_sim.context.text_encoders import load_text_encoder
 
@@ -69,8 +68,7 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
     if model == "hf-hub" and weights:
         return OpenClipEncoder(name, name, *_create(name, name, device))
     if model not in models:
-        known = [*embedded, *(plugin.name for plugin in entry_points(group=ENTRY_POINTS))]
-        raise _unknown_model(model, known, models)
+        raise _unknown_model(model, [*embedded, *PLUGINS], models)
     tags: list[str] = open_clip.list_pretrained_tags_by_model(model)
     if not separator or not weights:
         raise UsageError(f"encoder {name!r} needs weights: {model}:TAG with one of {', '.join(tags) or 'no known tags'}, or {model}:/path/to/weights")
@@ -207,13 +205,10 @@ def _quiet() -> Iterator[None]:
 
 def _unknown_model(name: str, embedded: Sequence[str], models: Sequence[str]) -> UnknownNameError:
     """Open_clip knows some 150 models: list the embedded encoders and the models nearest to what was asked."""
-    import difflib
-
-    near = difflib.get_close_matches(name, [*embedded, *models], n=5, cutoff=0.5)
+    near = nearest(name, [*embedded, *models], 5)
     return UnknownNameError("encoder", name, {*embedded, *near}, "and MODEL:TAG of open_clip.list_pretrained()")
 
 
 def digest(file: Path) -> str:
     """The beginning of a file's SHA-256, for identities."""
-    with file.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()[:12]
+    return file_digest(file)[:12]

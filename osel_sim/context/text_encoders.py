@@ -4,7 +4,6 @@
 is fitted on the texts of the log that it encodes, without outcomes, so it knows which of their words are telling, but not what any word means.
 """
 
-import hashlib
 import importlib
 import importlib.util
 import json
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from osel_sim.context.encoder import OpenClipEncoder, digest, load_encoder
 from osel_sim.context.sentence_files import check_sentence_model
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.files import content_digest, file_digest
 from osel_sim.core.hub import download, offline_if_unreachable
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, trusted, what_failed
 from osel_sim.interface.encoder import Context, Encoder, Image
@@ -123,7 +123,7 @@ class TfidfEncoder:
             self._axes.fit(table)
         self._known: dict[str, Context] = dict(zip(different, self._project(table), strict=True))
         settings = json.dumps([dimension, version("scikit-learn"), different], ensure_ascii=False)
-        self.identity = f"{TFIDF}@{hashlib.sha256(settings.encode()).hexdigest()[:12]}"
+        self.identity = f"{TFIDF}@{content_digest(settings)[:12]}"
 
     def encode(self, images: Sequence[Image], instruction: str) -> Context:
         """Context (d,) float32 of length one, or zero where no word is known."""
@@ -217,7 +217,6 @@ def _folder(model: str) -> Path | None:
     weights = folder / WEIGHTS
     if not weights.is_file():
         return None
-    with weights.open("rb") as handle:
-        if hashlib.file_digest(handle, "sha256").hexdigest() != original:
-            raise CheckpointError(f"{weights}: is not what was published as {model}; remove the package {module.replace('_', '-')}")
+    if file_digest(weights) != original:
+        raise CheckpointError(f"{weights}: is not what was published as {model}; remove the package {module.replace('_', '-')}")
     return folder

@@ -1,6 +1,5 @@
 """One instance with one policy, looked at closely: what it saw, what it did, how it ended (`python -m osel_sim.doctor --policy FILE`)."""
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, override
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
+from osel_sim.core.files import finite, write_json
 from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
 from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
@@ -151,9 +151,7 @@ def check_policy(spec: PolicySpec, task: str, seed: int, level: int, out: Path, 
         report.pictures = _pictures(spec, [observation for observation, _ in watched.seen], out)
     _actions(report, [call.actions for _, call in watched.seen if call.actions is not None], other.answer)
     _end(report, outcome)
-    partial = out / "report.json.partial"
-    partial.write_text(json.dumps(asdict(report), indent=2) + "\n")
-    partial.replace(out / "report.json")
+    write_json(out / "report.json", finite(asdict(report)))
     return report
 
 

@@ -4,9 +4,7 @@
 rollout log at hand. `replay.json` is written last and names the digest of `choices.npz`: where it is there, the rest is there and belongs to it.
 """
 
-import hashlib
 import io
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 from osel_sim.core.arrays import read_arrays
 from osel_sim.core.csv_text import to_csv
 from osel_sim.core.errors import DataError, UsageError
-from osel_sim.core.files import read_json, write_json
+from osel_sim.core.files import content_digest, is_partial, read_json, write_bytes, write_json
 
 SCHEMA_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
@@ -69,7 +67,7 @@ def check_replay_folder(folder: Path, overwrite: bool) -> None:
     if (folder / REPLAY).exists() or (folder / OFF_POLICY).exists():
         if not overwrite:
             raise UsageError(f"--out {folder} holds a replay; add --overwrite to replace it, or give another folder")
-    elif folder.exists() and any(not item.name.endswith(".partial") and item.name != CHOICES for item in folder.iterdir()):
+    elif folder.exists() and any(not is_partial(item) and item.name != CHOICES for item in folder.iterdir()):
         raise UsageError(f"--out {folder} is not empty and holds no {REPLAY}; give a new folder")
 
 
@@ -85,14 +83,14 @@ def write_replay(folder: Path, result: Mapping[str, Any], choices: Choices, tabl
         ValueError: NaN or infinity in `result`.
     """
     content = _npz(choices)
-    digest = hashlib.sha256(content).hexdigest()
+    digest = content_digest(content)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / REPLAY).unlink(missing_ok=True)
-        _replace(folder / CHOICES, content)
+        write_bytes(folder / CHOICES, content)
         for name, rows in tables.items():
             if rows:
-                _replace(folder / f"{name}.csv", _csv(rows))
+                write_bytes(folder / f"{name}.csv", _csv(rows))
             else:
                 (folder / f"{name}.csv").unlink(missing_ok=True)
         write_json(folder / REPLAY, {"schema_version": SCHEMA_VERSION, **result, "choices_sha256": digest})
@@ -114,7 +112,7 @@ def read_replay(folder: Path) -> tuple[dict[str, Any], Choices]:
     file = folder / CHOICES
     try:
         content = file.read_bytes()
-        if hashlib.sha256(content).hexdigest() != result.get("choices_sha256"):
+        if content_digest(content) != result.get("choices_sha256"):
             raise DataError(f"{file} is damaged, or does not belong to the {REPLAY} beside it")
         arrays = read_arrays(file, "choices", content)
         chosen = {key.removeprefix(_PREFIX): array for key, array in arrays.items() if key.startswith(_PREFIX)}
@@ -154,9 +152,3 @@ def _npz(choices: Choices) -> bytes:
 def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
     headings = list(rows[0]) if rows else []
     return to_csv([headings, *([row.get(key) for key in headings] for row in rows)]).encode() if rows else b""
-
-
-def _replace(file: Path, content: bytes) -> None:
-    partial = file.with_name(f"{file.name}.partial")
-    partial.write_bytes(content)
-    os.replace(partial, file)

@@ -8,13 +8,13 @@ in what this suite records. `axes`: those perturbed beyond `level`, such as `cam
 """
 
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import atomic
 from osel_sim.interface.outcome import Outcome, Seconds
 
 if TYPE_CHECKING:
@@ -112,9 +112,8 @@ def write_rollouts(folder: Path, rows: Iterable[Row], metadata: dict[str, Any]) 
     annotated = schema().with_metadata({_PREFIX + key.encode(): json.dumps(value, sort_keys=True).encode() for key, value in sorted(extra.items())})
     table = pyarrow.Table.from_pylist([vars(row) for row in rows], schema=annotated)
     file = folder / ROLLOUTS
-    partial = file.with_suffix(".partial")
-    pyarrow.parquet.write_table(table, partial, compression="zstd")
-    os.replace(partial, file)
+    with atomic(file) as partial:
+        pyarrow.parquet.write_table(table, partial, compression="zstd")
     return file
 
 

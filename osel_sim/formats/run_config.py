@@ -15,7 +15,7 @@ from typing import Any
 
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
-from osel_sim.core.files import digest, read_json, write_json
+from osel_sim.core.files import digest, is_partial, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.task_file import TaskSpec
 
@@ -82,7 +82,7 @@ def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) 
         if resume:
             raise UsageError(f"--resume: there is no run in {folder}; leave --resume out to begin one, or give the folder with --out")
         check_writable(folder)
-        if folder.exists() and any(item.name != "run.partial" for item in folder.iterdir()):
+        if folder.exists() and any(not is_partial(item) for item in folder.iterdir()):
             raise UsageError(f"--out {folder} is not empty and holds no {RUN}; give a new folder")
         return
     if not resume:

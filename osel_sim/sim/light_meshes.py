@@ -6,7 +6,6 @@ same to the last bit.
 
 import hashlib
 import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core.arrays import read_arrays
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import atomic
 
 KEEP = 0.04
 """Fraction of faces kept."""
@@ -132,9 +132,8 @@ def _proper(faces: NDArray[Any]) -> NDArray[np.int32]:
 
 def _save(file: Path, light: dict[str, NDArray[Any]]) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as handle:
+    with atomic(file, shared=True) as partial, partial.open("wb") as handle:
         np.savez(handle, **light)  # type: ignore[arg-type]
-    os.replace(handle.name, file)  # atomic: several processes may make it at once, with the same bytes
 
 
 def _load(file: Path) -> dict[str, NDArray[Any]] | None:

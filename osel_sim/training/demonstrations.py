@@ -6,7 +6,6 @@ LeRobotDataset that was not finalised cannot be read.
 
 import functools
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.files import read_json, write_text
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM
 
@@ -42,6 +42,9 @@ class Shard:
     image_size: int
     levels: tuple[int, ...]
     axes: Mapping[str, int] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return self.folder.name
 
 
 def features(task: TaskSpec, image_size: int) -> dict[str, dict[str, Any]]:
@@ -90,7 +93,7 @@ def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
     """
     done = shard.folder / "done.json"
     if done.is_file():
-        report = json.loads(done.read_text())
+        report = read_json(done)
         return report["frames"], report["episodes"], report["failed"]
     shutil.rmtree(shard.folder, ignore_errors=True)
 
@@ -115,9 +118,7 @@ def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
         dataset.save_episode()
         frames, episodes = frames + len(rows), episodes + 1
     dataset.finalize()
-    temporary = shard.folder / "done.json.part"
-    temporary.write_text(json.dumps({"frames": frames, "episodes": episodes, "failed": failed}))
-    os.replace(temporary, done)
+    write_text(done, json.dumps({"frames": frames, "episodes": episodes, "failed": failed}))
     return frames, episodes, failed
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim.context.encoder import DEFAULT_ENCODER, VOCABULARY, WEIGHTS
 from osel_sim.core.errors import UnknownNameError, UsageError
-from osel_sim.core.files import finite, write_json
+from osel_sim.core.files import atomic, finite, write_json
 from osel_sim.formats.levels import LEVELS
 from osel_sim.formats.library import select_tasks
 from osel_sim.formats.task_file import TaskSpec
@@ -171,6 +171,5 @@ def _save_weights(model: Any, file: Path) -> None:
 
     state = {name: value.detach().cpu() for name, value in model.state_dict().items()}
     halved = {name: value.half() if value.dtype == torch.float32 else value for name, value in state.items()}
-    temporary = file.with_suffix(".tmp")
-    save_file({name: value.contiguous() for name, value in halved.items()}, temporary)
-    temporary.replace(file)
+    with atomic(file) as partial:
+        save_file({name: value.contiguous() for name, value in halved.items()}, partial)
