@@ -111,7 +111,7 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
 
 
 def _plan(config: RecordConfig) -> "Plan":
-    from osel_sim.context.encoder import DEFAULT_ENCODER
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
     from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes

@@ -155,7 +155,8 @@ class _Run:
 
     def execute(self) -> RunResult:
         """Do it."""
-        from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
+        from osel_sim.context.encoder import load_encoder
+        from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
         from osel_sim.core import content
         from osel_sim.formats.run_config import check_run_folder, environment, start_or_resume
         from osel_sim.sim.gl import choose_backend

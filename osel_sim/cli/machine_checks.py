@@ -177,7 +177,7 @@ def _checkpoint(policy: PolicySpec) -> Check:
 
 
 def _encoder() -> Iterator[Check]:
-    from osel_sim.context.encoder import DEFAULT_ENCODER
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
 
     folder = content.root() / "assets" / "encoders" / DEFAULT_ENCODER
     train = f"python -m osel_sim.train --encoder --data DIR --out {folder}"

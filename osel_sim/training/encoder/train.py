@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.context.encoder import DEFAULT_ENCODER, VOCABULARY, WEIGHTS
+from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER, VOCABULARY, WEIGHTS
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.files import atomic, finite, write_json
 from osel_sim.formats.levels import LEVELS
@@ -82,7 +82,7 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
     import open_clip
     import torch
 
-    from osel_sim.context.encoder import OpenClipEncoder
+    from osel_sim.context.open_clip_encoder import OpenClipEncoder
     from osel_sim.training.encoder import recipe
     from osel_sim.training.encoder.evaluate import measure_all
     from osel_sim.training.encoder.scenes import cached_scenes
