@@ -33,7 +33,7 @@ def read_json(file: Path) -> dict[str, Any]:
     """
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{file} cannot be read as JSON ({error})") from None
     if not isinstance(data, dict):
         raise DataError(f"{file}: expected an object, got {type(data).__name__}")

@@ -18,6 +18,7 @@ import pyarrow.parquet as parquet
 from numpy.typing import NDArray
 from tqdm import tqdm  # type: ignore[import-untyped]
 
+from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
 from osel_sim.interface.policy import ACTION_DIM, STATE_DIM
 from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations, read_json
@@ -76,6 +77,8 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
     files = sorted((folder / "data").glob("*/*.parquet"))
     if not files:
         raise DataError(f"{folder}: no data/*/*.parquet")
+    for file in files:
+        check_rows(file)
     wanted = ["observation.state", "action", "episode_index", "task_index"]
     wanted += [name for name in features if name.startswith("annotation.")]
     columns = _columns(files, wanted)
