@@ -204,3 +204,18 @@ def test_a_pickle_is_not_loaded(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="objects"):
         ContextCache(npz(tmp_path, **{"e|instances": buffer.getvalue()}).parent)
     assert not (tmp_path / "ran").exists()
+
+
+def test_a_parquet_file_of_more_rows_than_it_can_hold_is_refused(tmp_path: Path) -> None:
+    import pyarrow
+    from pyarrow import parquet
+
+    from osel_sim.formats.rollout_log import ROLLOUTS, read_rollouts
+    from osel_sim.ingestion.readers import _parquet
+
+    equal = pyarrow.table({"success": pyarrow.repeat(True, 2_000_000)})
+    for name in (ROLLOUTS, "table.parquet"):
+        parquet.write_table(equal, tmp_path / name, compression="zstd")
+    for read in (lambda: read_rollouts(tmp_path), lambda: list(_parquet(tmp_path / "table.parquet"))):
+        with pytest.raises(DataError, match=r"claims 2000000 rows, a file of \d+ bytes cannot hold so many"):
+            read()

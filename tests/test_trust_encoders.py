@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from osel_sim.context import encoder as open_clip_encoder
+from osel_sim.context import open_clip_encoder
 from osel_sim.context.encoder import load_encoder
 from osel_sim.context.open_clip_encoder import VOCABULARY, embedded_encoders
 from osel_sim.context.sentence_files import check_sentence_model

@@ -1,4 +1,7 @@
-"""Reading `.npz` files of others: what one claims to hold is checked against its size before anything is inflated. No objects, so no pickle."""
+"""Reading `.npz` files of others: what one claims to hold is checked against its size before anything is inflated. No objects, so no pickle.
+
+The same check for the number of rows of a Parquet file: a column of equal values takes a few bytes, however long it is.
+"""
 
 import io
 import math
@@ -19,6 +22,8 @@ MAX_HEADER = 1 << 16  # bytes; numpy's own have some hundred
 FREE = 64 << 20
 """So many bytes may be claimed by a file of any size: equal values compress a thousandfold."""
 MAX_RATIO = 100  # beyond that
+FREE_ROWS = 1_000_000
+ROWS_A_BYTE = 64  # a yes or no takes a bit, and repeats of it less
 
 
 def read_arrays(file: Path, what: str, content: bytes | None = None) -> dict[str, NDArray[Any]]:
@@ -55,6 +60,20 @@ def read_arrays(file: Path, what: str, content: bytes | None = None) -> dict[str
         zipfile.BadZipFile,
     ) as error:
         raise DataError(f"{file}: not a file of {what} ({' '.join(str(error).split())[:200] or type(error).__name__})") from None
+
+
+def check_rows(file: Path) -> None:
+    """Whether a Parquet file is large enough for its number of rows.
+
+    Raises:
+        DataError: it claims more than it can hold.
+        pyarrow.ArrowException, OSError: it cannot be read.
+    """
+    from pyarrow.parquet import read_metadata
+
+    rows, size = read_metadata(file).num_rows, file.stat().st_size
+    if rows > max(FREE_ROWS, ROWS_A_BYTE * size):
+        raise DataError(f"{file}: claims {rows} rows, a file of {size} bytes cannot hold so many")
 
 
 def _check(archive: zipfile.ZipFile, size: int) -> None:

@@ -110,7 +110,7 @@ def read_lines(file: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
             return
         try:
             data = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise DataError(f"{file}, line {number}: not JSON ({error})") from None
         if not isinstance(data, dict):
             raise DataError(f"{file}, line {number}: expected an object, got {type(data).__name__}")

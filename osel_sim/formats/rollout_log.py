@@ -13,6 +13,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic
 from osel_sim.interface.outcome import Outcome, Seconds
@@ -134,6 +135,7 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
         )
     try:
         found = pyarrow.parquet.read_schema(file)
+        check_rows(file)
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(f"{file} is not a Parquet file ({error})") from None
     raw = found.metadata or {}
