@@ -15,7 +15,9 @@ from osel_sim.core.errors import UsageError
 from osel_sim.core.processes import end_with_parent
 from osel_sim.formats import library
 from osel_sim.formats.levels import parse_axes, resolve
+from osel_sim.formats.run_config import robots_said
 from osel_sim.formats.task_file import TaskSpec
+from osel_sim.sim.robots import with_robot
 from osel_sim.training.annotations import SIDE_FILE, read_json
 
 SHARD = 20
@@ -39,13 +41,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--axis", action="append", default=[], metavar="AXIS=LEVEL", help="one axis at a level of its own, such as camera=2; repeatable"
     )
+    parser.add_argument("--robot", metavar="NAME", help="robot that does it, such as UR5e (default: the one the task file names, else Panda)")
     parser.add_argument("--image-size", type=cli.positive_int, default=96, help="pixels, square (default 96)")
     parser.add_argument("--workers", type=cli.positive_int, default=os.cpu_count() or 1, help="processes (default: one a core)")
     parser.add_argument("--resume", action="store_true", help="go on with --out: finished shards are kept")
     parser.add_argument("--tasks", type=cli.folder, default=None, help="folder with task files of your own")
     options = parser.parse_args(arguments)
 
-    tasks = library.select_tasks(options.task, options.tasks)
+    tasks = with_robot(library.select_tasks(options.task, options.tasks), options.robot)
     axes = parse_axes(options.axis)
     outs = [options.out] if len(tasks) == 1 else [options.out / task.name for task in tasks]
     for task, out in zip(tasks, outs, strict=True):
@@ -55,6 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
             resolve(level, axes, task.axes, task.name)  # refuses an unknown level or axis before anything is written
     for task, out in zip(tasks, outs, strict=True):
         settings = {"task": task.name, "task_version": task.version, "levels": options.level, "axes": axes, "image_size": options.image_size}
+        settings |= {"robot": None, **robots_said([task])}
         _check_settings(_shards_folder(out), settings)
         if _seeds(out) == options.episodes:
             print(f"{out} is complete")  # and stays as it is: training tells datasets apart by when their files were written, too
@@ -95,7 +99,7 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     choose_backend()
     _quiet_lerobot()
     shards = [
-        Shard(task.file, _shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes)
+        Shard(task.file, _shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes, task.robot)
         for first in range(0, episodes, SHARD)
         for count in (min(SHARD, episodes - first),)
     ]

@@ -16,6 +16,7 @@ from osel_sim.core import content
 from osel_sim.core.errors import ContentError, DisplayError
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.sim.robots import with_robot
 
 DISTRIBUTION = "osel-sim"
 CONFIG = "config.json"
@@ -61,6 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--task", default="pick_place", help="task of that instance (default: %(default)s)")
     parser.add_argument("--seed", type=cli.non_negative_int, default=0, help="seed of that instance (default: %(default)s)")
     parser.add_argument("--level", type=cli.non_negative_int, default=0, help="its level (default: %(default)s)")
+    parser.add_argument("--robot", metavar="NAME", help="its robot, such as UR5e (default: the one the task file names, else Panda)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where its pictures go (default: runs/doctor/POLICY)")
     options = parser.parse_args(arguments)
     if options.policy is not None:
@@ -80,7 +82,8 @@ def _examine_policy(options: argparse.Namespace) -> int:
 
     spec, folder = find_policy(options.policy, options.policies_dir)
     out = options.out or Path("runs") / "doctor" / spec.name
-    report = check_policy(spec, options.task, options.seed, options.level, out, options.tasks, folder)
+    task = with_robot([load_task_file(content.find("tasks", options.task, options.tasks))], options.robot)[0]
+    report = check_policy(spec, task, options.seed, options.level, out, folder)
     if options.json:
         print(json.dumps(asdict(report), indent=2))
     else:
@@ -192,7 +195,7 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
         yield Check("tasks", "none", f"no task file in {content.root() / 'tasks'}", MISSING, _install(DISTRIBUTION))
     for name, file in found.items():
         try:
-            yield Check("tasks", name, load_task_file(file).title)
+            yield Check("tasks", name, with_robot([load_task_file(file)])[0].title)
         except ContentError as error:
             yield Check("tasks", name, str(error), MISSING, f"correct {file.name}")
 

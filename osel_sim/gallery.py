@@ -62,6 +62,7 @@ def parser() -> cli.Parser:
     add("--each-axis", action="store_true", help="of one task: a row for each axis alone")
     add("--seed", type=cli.non_negative_int, default=0, help="of the instances (default: %(default)s)")
     add("--size", type=cli.positive_int, default=256, help="pixels of a picture, square (default: %(default)s)")
+    add("--robot", metavar="NAME", help="robot that stands there, such as UR5e (default: the one each task file names, else Panda)")
     add("--camera", choices=("agentview", "wrist"), default="agentview", help="default: %(default)s")
     add("--out", type=Path, required=True, metavar="FILE", help="the .png to write")
     add("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
@@ -74,8 +75,9 @@ def _sheet(options: argparse.Namespace, names: Sequence[str]) -> "NDArray[np.uin
     from osel_sim.formats.task_file import load_task_file
     from osel_sim.sim.env import TaskEnv
     from osel_sim.sim.gl import choose_backend
+    from osel_sim.sim.robots import with_robot
 
-    tasks = [load_task_file(content.find("tasks", name, options.tasks)) for name in names]
+    tasks = with_robot([load_task_file(content.find("tasks", name, options.tasks)) for name in names], options.robot)
     choose_backend()
     rows: list[NDArray[np.uint8]] = []
     for task in tasks:

@@ -12,6 +12,7 @@ from osel_sim.cli.reward_flags import DEFAULT_PRESET
 from osel_sim.core import content
 from osel_sim.core.errors import DataError, OselError, UsageError
 from osel_sim.formats import library
+from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.run import NOISE_HELP, SPLITS
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ def parser() -> cli.Parser:
     add("--policies", nargs="+", metavar="NAME", help="policies to run (default: all there are)")
     add("--level", type=cli.non_negative_int, nargs="+", default=[0], help="how hard scenes are perturbed, 0 to 3; several take turns (default: 0)")
     add("--axis", action="append", default=[], metavar="AXIS=LEVEL", help="one axis at a level of its own, such as camera=2; repeatable")
+    add("--robot", metavar="NAME", help="robot that does all of them, such as UR5e (default: the one each task file names, else Panda)")
     add("--action-noise", type=cli.non_negative_float, default=0.0, metavar="S", help=NOISE_HELP)
     add("--split", choices=SPLITS, default="test", help="which instances (default: %(default)s)")
     add("--start-seed", type=cli.non_negative_int, default=0, metavar="S", help="seed of the first instance (default: %(default)s)")
@@ -77,15 +79,16 @@ def _record(options: argparse.Namespace) -> int:
     from osel_sim.episodes.recording import Recording
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, start_or_resume
+    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, robots_said, start_or_resume
     from osel_sim.sim.gl import choose_backend
+    from osel_sim.sim.robots import with_robot
 
     added_encoder = options.encoder is not None  # one given is added; the encoder that was there must not have changed
     if options.resume and not options.task and options.out is not None:
         check_folder(options.out, {}, resume=True)
         _take_settings(options, read_json(options.out / RUN).get("configuration", {}))
     options.repeats, options.repeat_every = options.repeats or 1, options.repeat_every or 1
-    tasks = library.select_tasks(options.task, options.tasks)
+    tasks = with_robot(library.select_tasks(options.task, options.tasks), options.robot)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
     if options.out is None:
@@ -108,6 +111,7 @@ def _record(options: argparse.Namespace) -> int:
     axes = sorted({instance.axes for instance in plan.instances.values() if instance.axes})  # refuses an unknown level or axis before anything loads
     configuration: dict[str, Any] = {
         "tasks": [task.name for task in tasks],
+        **robots_said(tasks),
         "policies": [spec.name for spec in policies],
         "instances": options.instances,
         "start_seed": options.start_seed,
@@ -156,6 +160,12 @@ def _take_settings(options: argparse.Namespace, configuration: dict[str, Any]) -
         options.encoder = options.encoder or configuration["encoder"].partition("@")[0]
         for name in ("repeats", "repeat_every"):
             setattr(options, name, getattr(options, name) or configuration[name])
+        began = configuration.get("robot")
+        if options.robot not in (None, began or DEFAULT_ROBOT):
+            raise UsageError(
+                f"--robot {options.robot}: {options.out / 'run.json'} began with {began or DEFAULT_ROBOT}; leave it out, or give another --out"
+            )
+        options.robot = began if isinstance(began, str) else options.robot
         flags = parser()
         for name, began in (("level", configuration["levels"]), *((name, configuration[name]) for name in _FIXED)):
             given = getattr(options, name)

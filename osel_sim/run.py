@@ -67,6 +67,7 @@ def parser() -> cli.Parser:
         "--level", type=cli.non_negative_int, nargs="+", default=[0], help="how hard scenes are perturbed, 0 to 3; several mix at random (default: 0)"
     )
     add("--axis", action="append", default=[], metavar="AXIS=LEVEL", help="one axis at a level of its own, such as camera=2; repeatable")
+    add("--robot", metavar="NAME", help="robot that does all of them, such as UR5e (default: the one each task file names, else Panda)")
     add("--action-noise", type=cli.non_negative_float, default=0.0, metavar="S", help=NOISE_HELP)
     add("--split", choices=SPLITS, default="test", help="which instances (default: %(default)s)")
     add("--encoder", metavar="NAME", help="osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder")
@@ -86,19 +87,22 @@ def _run(options: argparse.Namespace) -> int:
     from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.formats.levels import parse_axes, resolve, split_off
     from osel_sim.formats.run_config import check_folder, environment, start_or_resume
+    from osel_sim.sim.robots import with_robot
 
     if options.tensorboard:
         from osel_sim.episodes.tensorboard import check_installed
 
         check_installed()
-    tasks = library.select_tasks(options.task, options.tasks)
+    tasks = with_robot(library.select_tasks(options.task, options.tasks), options.robot)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
     weights = weights_of(options)[0]
     _check_selector(options.selector, [spec.name for spec in policies], warm=options.warm_start is not None)
     folder = (
         options.out
-        or Path("runs") / f"{'-'.join(name.replace(':', '-') for name in options.task)}-{options.selector.replace(':', '-')}-s{options.seed}"
+        or Path("runs")
+        / f"{'-'.join(name.replace(':', '-') for name in options.task)}-{options.selector.replace(':', '-')}-s{options.seed}"
+        f"{f'-{options.robot}' if options.robot else ''}"
     )
     axes = parse_axes(options.axis)
     above = sorted(
@@ -323,11 +327,12 @@ def _configuration(
 
     from osel_sim.core.files import digest
     from osel_sim.formats.rollout_log import ROLLOUTS
-    from osel_sim.formats.run_config import content_digests
+    from osel_sim.formats.run_config import content_digests, robots_said
 
     warm = {"warm_start": digest(options.warm_start / ROLLOUTS)} if options.warm_start else {}
     return {
         "tasks": [task.name for task in tasks],
+        **robots_said(tasks),
         "episodes": options.episodes,
         "policies": [spec.name for spec in policies],
         "selector": options.selector,
