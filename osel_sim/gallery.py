@@ -48,6 +48,8 @@ class GalleryConfig(Settings):
     """pixels of a picture, square"""
     camera: Annotated[Literal["agentview", "wrist"], MAIN] = "agentview"
     """which camera"""
+    robot: Annotated[str | None, MAIN] = None
+    """robot that stands there, such as UR5e (default: the one each task file names, else Panda)"""
     tasks: Annotated[Folder | None, CONTENT] = None
     """folder with task files of your own"""
 
@@ -75,8 +77,9 @@ def _sheet(config: GalleryConfig, names: Sequence[str]) -> "NDArray[np.uint8]":
     from osel_sim.formats.task_file import load_task_file
     from osel_sim.sim.env import TaskEnv
     from osel_sim.sim.gl import choose_backend
+    from osel_sim.sim.robots import with_robot
 
-    tasks = [load_task_file(content.find("tasks", name, config.tasks)) for name in names]
+    tasks = with_robot([load_task_file(content.find("tasks", name, config.tasks)) for name in names], config.robot)
     choose_backend()
     rows: list[NDArray[np.uint8]] = []
     for task in tasks:

@@ -111,15 +111,16 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
 
 
 def _plan(config: RecordConfig) -> "Plan":
-    from osel_sim.context.encoder import DEFAULT_ENCODER
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
     from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
     from osel_sim.formats.library import select_tasks
+    from osel_sim.sim.robots import with_robot
 
     policies = choose_policies(config.policies, config.policies_dir)
     return Plan(
-        tasks=tuple(select_tasks(config.task, config.tasks)),
+        tasks=tuple(with_robot(select_tasks(config.task, config.tasks), config.robot)),
         policies=tuple(policies),
         everyone=tuple(with_fallbacks(policies, config.policies_dir)),
         seeds=range(config.start_seed, config.start_seed + config.instances),
@@ -135,11 +136,12 @@ def _plan(config: RecordConfig) -> "Plan":
 
 def _configuration(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
     """Everything the rollout log depends on but the encoder, content of files included."""
-    from osel_sim.formats.run_config import content_digests
+    from osel_sim.formats.run_config import content_digests, robots_said
 
     return {
         "tasks": [task.name for task in plan.tasks],
         "policies": [spec.name for spec in plan.policies],
+        **robots_said(plan.tasks),
         "instances": config.instances,
         "start_seed": config.start_seed,
         "repeats": plan.repeats,
@@ -156,6 +158,7 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
     """The settings that a recording began with; policies, repeats and an encoder that were given come in addition."""
     from osel_sim.core.files import read_json
     from osel_sim.formats.run_config import RUN, check_run_folder
+    from osel_sim.interface.robot import DEFAULT_ROBOT
 
     folder = cast(Path, config.out)
     check_run_folder(folder, {}, resume=True)
@@ -168,6 +171,10 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
             if (list(own) if isinstance(own, tuple) else own) != began[_FIXED[name]]:
                 words = " ".join(map(str, own)) if isinstance(own, tuple) else own
                 raise SettingError(name, f"{words}: {folder / RUN} began with {began[_FIXED[name]]}; leave it out, or give another --out")
+        robot = began.get("robot")
+        if config.robot not in (None, robot or DEFAULT_ROBOT):
+            raise SettingError("robot", f"{config.robot}: {folder / RUN} began with {robot or DEFAULT_ROBOT}; leave it out, or give another --out")
+        values["robot"] = robot if isinstance(robot, str) else None
         values["policies"] = tuple(dict.fromkeys([*began["policies"], *(config.policies or ())]))
         values["encoder"] = config.encoder or began["encoder"].partition("@")[0]
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}

@@ -77,7 +77,8 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     def folder(self) -> Path:
         """Where to write."""
         tasks = "-".join(name.replace(":", "-") for name in self.task)
-        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}-s{self.seed}"
+        robot = f"-{self.robot}" if self.robot else ""
+        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}-s{self.seed}{robot}"
 
     @property
     def filmed(self) -> frozenset[int]:
@@ -138,13 +139,14 @@ class _Run:
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes, resolve, split_off
         from osel_sim.formats.library import select_tasks
+        from osel_sim.sim.robots import with_robot
 
         self.config, self.objects, self.factory = config, objects, factory
         if config.tensorboard:
             from osel_sim.episodes.tensorboard import check_installed
 
             check_installed()
-        self.tasks = select_tasks(config.task, config.tasks)
+        self.tasks = with_robot(select_tasks(config.task, config.tasks), config.robot)
         self.policies = choose_policies(config.policies, config.policies_dir, objects)
         self.everyone = with_fallbacks(self.policies, config.policies_dir)
         self.weights = weights_of(config)[0]
@@ -155,7 +157,8 @@ class _Run:
 
     def execute(self) -> RunResult:
         """Do it."""
-        from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
+        from osel_sim.context.encoder import load_encoder
+        from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
         from osel_sim.core import content
         from osel_sim.formats.run_config import check_run_folder, environment, start_or_resume
         from osel_sim.sim.gl import choose_backend
@@ -211,12 +214,13 @@ class _Run:
         """Everything the journal depends on but the encoder, content of files included."""
         from osel_sim.core.files import digest
         from osel_sim.formats.rollout_log import ROLLOUTS
-        from osel_sim.formats.run_config import content_digests
+        from osel_sim.formats.run_config import content_digests, robots_said
 
         config = self.config
         warm = {"warm_start": digest(config.warm_start / ROLLOUTS)} if config.warm_start else {}
         return {
             "tasks": [task.name for task in self.tasks],
+            **robots_said(self.tasks),
             "episodes": config.episodes,
             "policies": [spec.name for spec in self.policies],
             "selector": config.selector,

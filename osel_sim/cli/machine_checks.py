@@ -15,6 +15,7 @@ from osel_sim.core.files import read_json
 from osel_sim.core.shown import shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.sim.robots import with_robot
 
 DISTRIBUTION = "osel-sim"
 CONFIG = "config.json"
@@ -145,7 +146,7 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
         yield Check("tasks", "none", f"no task file in {content.root() / 'tasks'}", MISSING, _install(DISTRIBUTION))
     for name, file in found.items():
         try:
-            yield Check("tasks", name, load_task_file(file).title)
+            yield Check("tasks", name, with_robot([load_task_file(file)])[0].title)
         except ContentError as error:
             yield Check("tasks", name, str(error), MISSING, f"correct {file.name}")
 
@@ -177,7 +178,7 @@ def _checkpoint(policy: PolicySpec) -> Check:
 
 
 def _encoder() -> Iterator[Check]:
-    from osel_sim.context.encoder import DEFAULT_ENCODER
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
 
     folder = content.root() / "assets" / "encoders" / DEFAULT_ENCODER
     train = f"python -m osel_sim.train --encoder --data DIR --out {folder}"

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.encoder import OpenClipEncoder, digest, load_encoder
+from osel_sim.context.open_clip_encoder import OpenClipEncoder, digest, load_open_clip
 from osel_sim.context.sentence_files import check_sentence_model
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
 from osel_sim.core.files import content_digest, file_digest
@@ -169,14 +169,11 @@ def load_text_encoder(name: str, device: str = "cpu", texts: Sequence[str] | Non
         texts: all texts of a log, which `tfidf` is fitted on.
 
     Raises:
-        UsageError: `tfidf` without texts, or the first of a pair is no open_clip encoder; otherwise as the encoders themselves.
+        UsageError: `tfidf` without texts; otherwise as the encoders themselves.
     """
     images, plus, text = name.rpartition("+") if name.endswith(f"+{TFIDF}") else _split(name)
     if plus:
-        pictures = load_encoder(images, device)
-        if not isinstance(pictures, OpenClipEncoder):
-            raise UsageError(f"encoder {name!r}: {images!r} is no open_clip encoder, of which the image half could be taken")
-        return ImagesAndText(pictures, load_text_encoder(text, device, texts))
+        return ImagesAndText(load_open_clip(images, device), load_text_encoder(text, device, texts))
     if text.startswith(SENTENCE):
         return SentenceEncoder(text, device)
     if text != TFIDF:
@@ -184,20 +181,6 @@ def load_text_encoder(name: str, device: str = "cpu", texts: Sequence[str] | Non
     if texts is None:
         raise UsageError(f"encoder {TFIDF!r} is fitted on the texts of a log, so only python -m osel_sim.ingest can use it")
     return TfidfEncoder(texts)
-
-
-def load_log_encoder(name: str, texts: Sequence[str], with_images: bool, device: str = "cpu") -> Encoder:
-    """Load an encoder for a log: of an open_clip encoder only the text half where there are no images.
-
-    Raises:
-        UsageError: an encoder of images for a log without any; otherwise as `load_encoder`.
-    """
-    if name.endswith(TFIDF) or SENTENCE in name:
-        if "+" in name and not with_images and (name.endswith(f"+{TFIDF}") or f"+{SENTENCE}" in name):
-            raise UsageError(f"encoder {name!r} wants images, and there are none; name the part after the + alone")
-        return load_text_encoder(name, device, texts)
-    encoder = load_encoder(name, device)
-    return TextOnly(encoder) if isinstance(encoder, OpenClipEncoder) and not with_images else encoder
 
 
 def _split(name: str) -> tuple[str, str, str]:

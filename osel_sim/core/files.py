@@ -121,7 +121,7 @@ def read_json(file: Path, hint: str = "") -> dict[str, Any]:
         data = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{file} cannot be read as JSON ({error})" + (f"; {hint}" if hint else "")) from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{file} cannot be read as JSON ({error})") from None
     if not isinstance(data, dict):
         raise DataError(f"{file}: expected an object, got {type(data).__name__}")

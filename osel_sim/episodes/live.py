@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -149,7 +149,7 @@ class LiveRun:
             }
         )
         # The journal comes last: what it does not have did not happen.
-        self._journal.append(asdict(decision))
+        self._journal.append(decision.to_dict())
         self.decisions.append(decision)
         self._remember(rewards)
         self._learn(context, choice, decision.reward)
@@ -221,5 +221,6 @@ class LiveRun:
             reward=self._reward(outcome),
             fallback=outcome.fallback,
             error=outcome.error,
+            robot=instance.other_robot,
             **own,
         )

@@ -183,4 +183,5 @@ def make_row(instance: Instance, policy: str, repeat: int, outcome: Outcome) -> 
         fallback=outcome.fallback,
         error=outcome.error,
         axes=instance.axes,
+        robot=instance.other_robot,
     )

@@ -4,9 +4,7 @@
 rollout log at hand. `replay.json` is written last and names the digest of `choices.npz`: where it is there, the rest is there and belongs to it.
 """
 
-import csv
 import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.arrays import read_arrays
+from osel_sim.core.csv_text import to_csv
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_bytes, write_json
 
@@ -114,11 +114,11 @@ def read_replay(folder: Path) -> tuple[dict[str, Any], Choices]:
         content = file.read_bytes()
         if content_digest(content) != result.get("choices_sha256"):
             raise DataError(f"{file} is damaged, or does not belong to the {REPLAY} beside it")
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            chosen = {key.removeprefix(_PREFIX): archive[key] for key in archive.files if key.startswith(_PREFIX)}
-            names = {key: tuple(str(value) for value in archive[key]) for key in ("instances", "policies")}
-            choices = Choices(names["instances"], names["policies"], archive["order"], archive["repeats"], chosen)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(file, "choices", content)
+        chosen = {key.removeprefix(_PREFIX): array for key, array in arrays.items() if key.startswith(_PREFIX)}
+        names = {key: tuple(str(value) for value in arrays[key]) for key in ("instances", "policies")}
+        choices = Choices(names["instances"], names["policies"], arrays["order"], arrays["repeats"], chosen)
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{file}: not a replay's choices ({' '.join(str(error).split())})") from None
     return result, choices
 
@@ -150,9 +150,5 @@ def _npz(choices: Choices) -> bytes:
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    text = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return text.getvalue().encode()
+    headings = list(rows[0]) if rows else []
+    return to_csv([headings, *([row.get(key) for key in headings] for row in rows)]).encode() if rows else b""

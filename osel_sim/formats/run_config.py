@@ -18,9 +18,12 @@ from osel_sim.core.errors import UsageError
 from osel_sim.core.files import digest, is_partial, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.task_file import TaskSpec
+from osel_sim.interface.robot import DEFAULT_ROBOT
 
 SCHEMA_VERSION = 1
 RUN = "run.json"
+UNSAID = ("robot",)
+"""Keys of a configuration that are left out where they say what is usual; they are compared all the same."""
 LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
 
 
@@ -65,6 +68,13 @@ def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -
     return digests
 
 
+def robots_said(tasks: Iterable[TaskSpec]) -> dict[str, Any]:
+    """`robot` of a configuration: the one that does all tasks, or the robot of each; nothing where that is the usual one."""
+    robots = {task.name: task.robot for task in tasks}
+    names = set(robots.values())
+    return {"robot": robots if len(names) > 1 else names.pop()} if names != {DEFAULT_ROBOT} else {}
+
+
 def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:
     """Refuse an output folder that cannot be used, before anything heavy is loaded.
 
@@ -88,7 +98,8 @@ def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) 
     if not resume:
         raise UsageError(f"--out {folder} is in use; add --resume to go on with what is in it, or give another folder")
     was = read_json(file).get("configuration", {})
-    _compare(file, {key: was.get(key) for key in configuration}, json.loads(json.dumps(configuration)))
+    now = {**dict.fromkeys(UNSAID), **configuration} if configuration else {}
+    _compare(file, {key: was.get(key) for key in now}, json.loads(json.dumps(now)))
 
 
 def check_writable(folder: Path) -> None:

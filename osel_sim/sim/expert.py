@@ -124,6 +124,7 @@ class Expert:
         offset[2] = entity.floor + RELEASE - height
         if entity.kind in FITTING and sideways > FIT:
             offset[2] = max(world.highest_point(place) + 0.015 - world.lowest_point(thing), offset[2])
+        offset[2] = max(-world.robot.lowering / POSITION_GAIN, offset[2])
         return self.towards(world.grip_position + offset, 0.0, CLOSED), False
 
     def push(self, thing: str, zone: str) -> tuple[Array, bool]:

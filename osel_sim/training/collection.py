@@ -49,7 +49,7 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     choose_backend()
     _quiet_lerobot()
     shards = [
-        Shard(task.file, shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes)
+        Shard(task.file, shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes, task.robot)
         for first in range(0, episodes, SHARD)
         for count in (min(SHARD, episodes - first),)
     ]

@@ -16,6 +16,7 @@ import numpy as np
 import pyarrow.parquet as parquet
 from numpy.typing import NDArray
 
+from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic, content_digest, is_partial, read_json
 from osel_sim.core.progress import progress as progress_bar
@@ -76,6 +77,8 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
     files = sorted((folder / "data").glob("*/*.parquet"))
     if not files:
         raise DataError(f"{folder}: no data/*/*.parquet")
+    for file in files:
+        check_rows(file)
     wanted = ["observation.state", "action", "episode_index", "task_index"]
     wanted += [name for name in features if name.startswith("annotation.")]
     columns = _columns(files, wanted)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.arrays import read_arrays
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic
 from osel_sim.core.progress import progress
@@ -55,10 +56,12 @@ class Scenes:
             DataError: it is something else.
         """
         try:
-            with np.load(file, allow_pickle=False) as archive:
-                return cls(**{field.name: archive[field.name] for field in fields(cls)})
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            raise DataError(f"{file}: not a file of scenes ({' '.join(str(error).split())}); remove it to render them again") from None
+            arrays = read_arrays(file, "scenes")
+            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+        except DataError as error:
+            raise DataError(f"{error}; remove it to render them again") from None
+        except KeyError as error:
+            raise DataError(f"{file}: not a file of scenes ({error}); remove it to render them again") from None
 
 
 def render_instances(task: TaskSpec, seeds: Iterable[int], split: str, size: int, levels: Sequence[int] = (0,)) -> Scenes:
