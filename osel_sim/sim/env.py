@@ -161,16 +161,6 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
 
         return project(self.world.model, self.world.data, points, self._camera(camera), size)
 
-    def camera_pose(self, camera: str, relative_to_gripper: bool) -> dict[str, Any]:
-        """Where a camera is (`osel_sim.training.projection.Pinhole` says what the entries mean)."""
-        index = self._camera(camera)
-        position, rotation = self.world.data.cam_xpos[index], self.world.data.cam_xmat[index].reshape(3, 3)
-        if relative_to_gripper:
-            turn = self.world.grip_matrix.T
-            position, rotation = turn @ (position - self.world.grip_position), turn @ rotation
-        mount = "gripper" if relative_to_gripper else "world"
-        return {"mount": mount, "position": position.tolist(), "rotation": rotation.tolist(), "fovy": float(self.world.model.cam_fovy[index])}
-
     def snapshot(self) -> EnvSnapshot:
         """The state now; `restore` goes on from it to the same bits."""
         return EnvSnapshot(self.world.snapshot(), self.steps, self._reached)
