@@ -13,9 +13,13 @@ from pathlib import Path
 
 from osel_sim import cli
 from osel_sim.core import content
-from osel_sim.core.errors import ContentError, DisplayError
+from osel_sim.core.errors import ContentError, DisplayError, OselError
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.interface.suite import OURS
+from osel_sim.policy.environment_fit import misfits
+from osel_sim.sim.specification import specification
+from osel_sim.suites.registry import load_suite, suite_names
 
 DISTRIBUTION = "osel-sim"
 CONFIG = "config.json"
@@ -36,7 +40,7 @@ class Check:
     """One thing looked at.
 
     Attributes:
-        area: python, packages, display, machine, tasks, policies, encoder.
+        area: python, packages, display, machine, tasks, suites, policies, encoder.
         name: what was looked at.
         found: what was found, in words.
         state: `ok`, `note` (good to know, nothing is blocked) or `missing` (a run needs it).
@@ -58,7 +62,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
     parser.add_argument("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
     parser.add_argument("--policy", metavar="NAME|FILE", help="run one instance with this policy and report on it")
-    parser.add_argument("--task", default="pick_place", help="task of that instance (default: %(default)s)")
+    parser.add_argument("--task", default="pick_place", help="task of that instance, also SUITE:TASK (default: %(default)s)")
     parser.add_argument("--seed", type=cli.non_negative_int, default=0, help="seed of that instance (default: %(default)s)")
     parser.add_argument("--level", type=cli.non_negative_int, default=0, help="its level (default: %(default)s)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where its pictures go (default: runs/doctor/POLICY)")
@@ -95,7 +99,7 @@ def examine(tasks: Path | None = None, policies: Path | None = None) -> list[Che
         tasks: a folder of the user's own task files.
         policies: a folder of the user's own policy files.
     """
-    return [*_python(), *_packages(), *_display(), *_machine(), *_tasks(tasks), *_policies(policies), *_encoder()]
+    return [*_python(), *_packages(), *_display(), *_machine(), *_tasks(tasks), *_suites(), *_policies(policies), *_encoder()]
 
 
 def _python() -> Iterator[Check]:
@@ -197,13 +201,27 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
             yield Check("tasks", name, str(error), MISSING, f"correct {file.name}")
 
 
+def _suites() -> Iterator[Check]:
+    """Suites of others that are installed; nothing of ours needs one."""
+    for name in suite_names():
+        if name != OURS:
+            try:
+                suite = load_suite(name)
+                yield Check("suites", name, f"{suite.spec.title}, {len(suite.tasks)} tasks")
+            except OselError as error:
+                yield Check("suites", name, str(error), NOTE)
+
+
 def _policies(folder: Path | None) -> Iterator[Check]:
     found = content.files("policies", folder)
     if not found:
         yield Check("policies", "none", f"no policy file in {content.root() / 'policies'}", MISSING, _install(DISTRIBUTION))
     for name, file in found.items():
         try:
-            yield _checkpoint(load_policy_file(file))
+            spec = load_policy_file(file)
+            yield _checkpoint(spec)
+            for key, problem in misfits(spec, specification()):
+                yield Check("policies", name, f"is for other suites than ours, or wrong: {key}: {problem}", NOTE)
         except ContentError as error:
             yield Check("policies", name, str(error), MISSING, f"correct {file.name}")
 

@@ -10,17 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from osel_sim import cli
-from osel_sim.core import content
-from osel_sim.core.errors import UsageError
-from osel_sim.formats.levels import AXES, LEVELS
+from osel_sim.core.errors import UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from osel_sim.sim.env import TaskEnv
+    from osel_sim.interface.environment import Environment
+    from osel_sim.interface.suite import Task
 
-ALL = "all"
 BAND, MARGIN, HEADER = 55, 130, 26
 """Pixels: the instruction below a picture, the row's name at the left, the levels at the top."""
 INK, GREY, PAPER = (30, 30, 30), (110, 110, 110), (255, 255, 255)
@@ -36,13 +34,14 @@ EXAMPLES = """examples:
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
     options = parser().parse_args(arguments)
-    known = list(content.files("tasks", options.tasks))
-    names = known if options.task in (None, [ALL]) else options.task
+    from osel_sim.suites.registry import ALL, select_tasks
+
+    tasks = select_tasks(options.task or [ALL], options.tasks)
     if options.out.suffix.lower() != ".png":
         raise UsageError(f"--out {options.out} must end in .png")
-    if options.each_axis and len(names) != 1:
-        raise UsageError(f"--each-axis shows one task: give --task with one of {', '.join(known)}")
-    picture = _sheet(options, names)
+    if options.each_axis and len(tasks) != 1:
+        raise UsageError(f"--each-axis shows one task: give --task with one of {', '.join(task.name for task in tasks)}")
+    picture = _sheet(options, tasks)
 
     import cv2
 
@@ -58,53 +57,56 @@ def parser() -> cli.Parser:
     """Flags of the command."""
     result = cli.Parser("gallery", "Draw a contact sheet: a row a task (or an axis), a column a level, the instruction underneath.", EXAMPLES)
     add = result.add_argument
-    add("--task", nargs="+", metavar="NAME", help="which tasks (default: all)")
+    add("--task", nargs="+", metavar="NAME", help="which tasks: names, tag:TAG, or all; of other suites SUITE:NAME (default: all)")
     add("--each-axis", action="store_true", help="of one task: a row for each axis alone")
     add("--seed", type=cli.non_negative_int, default=0, help="of the instances (default: %(default)s)")
     add("--size", type=cli.positive_int, default=256, help="pixels of a picture, square (default: %(default)s)")
-    add("--camera", choices=("agentview", "wrist"), default="agentview", help="default: %(default)s")
+    add("--camera", metavar="NAME", help="agentview or wrist; other suites have others (default: the one that encoders are shown)")
     add("--out", type=Path, required=True, metavar="FILE", help="the .png to write")
     add("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
     return result
 
 
-def _sheet(options: argparse.Namespace, names: Sequence[str]) -> "NDArray[np.uint8]":
+def _sheet(options: argparse.Namespace, tasks: "Sequence[Task]") -> "NDArray[np.uint8]":
     import numpy as np
 
-    from osel_sim.formats.task_file import load_task_file
-    from osel_sim.sim.env import TaskEnv
-    from osel_sim.sim.gl import choose_backend
-
-    tasks = [load_task_file(content.find("tasks", name, options.tasks)) for name in names]
-    choose_backend()
+    levels = sorted({level for task in tasks for level in task.suite.spec.levels})
     rows: list[NDArray[np.uint8]] = []
     for task in tasks:
-        with contextlib.closing(TaskEnv(task)) as env:
+        if options.camera not in (None, *task.specification.cameras):
+            raise UnknownNameError("camera", options.camera, task.specification.cameras, f"--camera; task {task.name}")
+        own = [level if level in task.suite.spec.levels else None for level in levels]
+        with contextlib.closing(task.open()) as env:
             if options.each_axis:
-                rows += [_row(options, env, axis, [{axis: level} for level in LEVELS]) for axis in AXES if axis in task.axes]
+                axes = [axis for axis in task.suite.spec.axes if axis in task.info.axes]
+                rows += [_row(options, task, env, axis, [None if level is None else {axis: level} for level in own]) for axis in axes]
             else:
-                rows.append(_row(options, env, task.name, [dict.fromkeys(task.axes, level) for level in LEVELS]))
+                rows.append(_row(options, task, env, task.name, own))
+    if not rows:
+        raise UsageError(f"--each-axis: task {tasks[0].name} has no axes")
     header = np.full((HEADER, rows[0].shape[1], 3), PAPER, np.uint8)
-    for level in LEVELS:
-        _write(header, f"level {level}", (MARGIN + level * options.size + 6, 18), INK, 0.5)
+    for column, level in enumerate(levels):
+        _write(header, f"level {level}", (MARGIN + column * options.size + 6, 18), INK, 0.5)
     return np.concatenate([header, *rows])
 
 
-def _row(options: argparse.Namespace, env: "TaskEnv", name: str, settings: Sequence[Mapping[str, int]]) -> "NDArray[np.uint8]":
-    """One row: the same seed, more and more perturbed."""
+def _row(
+    options: argparse.Namespace, task: "Task", env: "Environment", name: str, settings: "Sequence[int | Mapping[str, int] | None]"
+) -> "NDArray[np.uint8]":
+    """One row: the same seed, more and more perturbed: by a level, or by axes at levels of their own; None leaves a gap."""
     import numpy as np
-
-    from osel_sim.sim.instance import make_instance
 
     size: int = options.size
     row = np.full((size + BAND, MARGIN + len(settings) * size, 3), PAPER, np.uint8)
     for number, line in enumerate(textwrap.wrap(name.replace("_", " "), 14)):
         _write(row, line, (8, 24 + 20 * number), INK, 0.5)
-    for column, axes in enumerate(settings):
-        instance = make_instance(env.task, options.seed, axes=axes)
+    for column, setting in enumerate(settings):
+        if setting is None:
+            continue
+        instance = task.instance(options.seed, setting) if isinstance(setting, int) else task.instance(options.seed, axes=setting)
         env.load(instance)
         left = MARGIN + column * size
-        row[:size, left : left + size] = env.image(options.camera, size, size, "full")
+        row[:size, left : left + size] = env.image(options.camera or env.specification.context_camera, size, size, "full")
         for number, line in enumerate(textwrap.wrap(instance.instruction, size // 7)[:3]):
             _write(row, line, (left + 4, size + 15 + 15 * number), GREY, 0.36)
     return row

@@ -170,11 +170,12 @@ def _action_mse(options: argparse.Namespace) -> int:
     from osel_sim.episodes.drivers import choose_policies
     from osel_sim.ingestion.action_mse import Settings, measure, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
+    from osel_sim.sim.specification import specification
 
     start = time.perf_counter()
     if not options.dataset:
         raise UsageError("--dataset is missing: give the folder of a LeRobotDataset")
-    specs = choose_policies(options.policies, options.policies_dir)
+    specs = choose_policies(options.policies, specification(), options.policies_dir)
     cameras = {}
     for item in options.camera or []:
         camera, equals, column = item.partition("=")

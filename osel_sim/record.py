@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli
 from osel_sim.cli.reward_flags import DEFAULT_PRESET
-from osel_sim.core import content
 from osel_sim.core.errors import DataError, OselError, UsageError
-from osel_sim.formats import library
 from osel_sim.run import NOISE_HELP, SPLITS
 
 if TYPE_CHECKING:
@@ -49,7 +47,7 @@ def parser() -> cli.Parser:
     """Flags of the command."""
     result = cli.Parser("record", "Run every policy on the same instances and write the outcomes to a rollout log.", EXAMPLES)
     add = result.add_argument
-    add("--task", nargs="+", default=[], metavar="NAME", help="which tasks: names, tag:TAG, or all")
+    add("--task", nargs="+", default=[], metavar="NAME", help="which tasks: names, tag:TAG, or all; of other suites SUITE:NAME")
     add("--instances", type=cli.positive_int, default=200, metavar="N", help="number of instances of each task (default: %(default)s)")
     add("--repeats", type=cli.positive_int, metavar="R", help="episodes of each policy on an instance (default: 1)")
     add("--repeat-every", type=cli.positive_int, metavar="K", help="repeat on one in K instances of each level only (default: on all)")
@@ -73,20 +71,24 @@ def _record(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
     from osel_sim.core.files import read_json, write_json
     from osel_sim.episodes.declared_skills import declare
-    from osel_sim.episodes.drivers import choose_policies, with_fallbacks
+    from osel_sim.episodes.drivers import choose_policies, left_out, with_fallbacks
     from osel_sim.episodes.recording import Recording
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, start_or_resume
-    from osel_sim.sim.gl import choose_backend
+    from osel_sim.formats.run_config import RUN, check_folder, content_digests, start_or_resume
+    from osel_sim.suites.ran_with import ran_with
+    from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
     added_encoder = options.encoder is not None  # one given is added; the encoder that was there must not have changed
     if options.resume and not options.task and options.out is not None:
         check_folder(options.out, {}, resume=True)
         _take_settings(options, read_json(options.out / RUN).get("configuration", {}))
     options.repeats, options.repeat_every = options.repeats or 1, options.repeat_every or 1
-    tasks = library.select_tasks(options.task, options.tasks)
-    policies = choose_policies(options.policies, options.policies_dir)
+    tasks = select_tasks(options.task, options.tasks)
+    specification = common_specification(tasks)
+    policies = choose_policies(options.policies, specification, options.policies_dir)
+    if options.policies is None and (others := left_out(specification, options.policies_dir)):
+        print(f"not made for the environment of {specification.name}, and left out: {', '.join(others)} (--policies NAME says why)", file=sys.stderr)
     everyone = with_fallbacks(policies, options.policies_dir)
     if options.out is None:
         raise UsageError("--out is missing: give the folder to write to")
@@ -102,7 +104,7 @@ def _record(options: argparse.Namespace) -> int:
         encoder=encoder_name,
         repeats=options.repeats,
         repeat_every=options.repeat_every,
-        axes=parse_axes(options.axis),
+        axes=parse_axes(options.axis, known_axes(tasks)),
         action_noise=options.action_noise,
     )
     axes = sorted({instance.axes for instance in plan.instances.values() if instance.axes})  # refuses an unknown level or axis before anything loads
@@ -126,8 +128,7 @@ def _record(options: argparse.Namespace) -> int:
     skills = declare(policies, encoder, tasks, options.tasks)
     configuration["encoder"] = encoder.identity
     known["encoder"] = before.get("configuration", {}).get("encoder") if before and added_encoder else encoder.identity
-    ran_with = environment(choose_backend(), content.root())
-    for warning in start_or_resume(folder, known, ran_with, options.resume):
+    for warning in start_or_resume(folder, known, ran_with(tasks), options.resume):
         print(f"warning: {warning}", file=sys.stderr)
     recording = Recording(folder, plan, encoder.identity, skills)
     if recording.complete:

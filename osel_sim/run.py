@@ -10,17 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli
 from osel_sim.cli.reward_flags import add_reward_flags, weights_of
-from osel_sim.core import content
-from osel_sim.core.errors import OselError, UnknownNameError
-from osel_sim.formats import library
+from osel_sim.core.errors import UnknownNameError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.episodes.live import LiveRun
-    from osel_sim.episodes.tensorboard import TensorBoard
+    from osel_sim.episodes.run_subscribers import RunSubscriber
     from osel_sim.formats.policy_file import PolicySpec
-    from osel_sim.formats.task_file import TaskSpec
     from osel_sim.interface.encoder import Encoder
+    from osel_sim.interface.suite import Task
+    from osel_sim.reporting.live_page import LivePage
     from osel_sim.selection.reward import RewardWeights
 
 SPLITS = ("train", "validation", "test")
@@ -57,7 +56,7 @@ def parser() -> cli.Parser:
     add = result.add_argument
     add("--list", action="store_true", help="show tasks and policies, and leave")
     add("--json", action="store_true", help="with --list: as JSON")
-    add("--task", nargs="+", default=[], metavar="NAME", help="which tasks, mixed at random: names, tag:TAG, or all")
+    add("--task", nargs="+", default=[], metavar="NAME", help="which tasks, mixed at random: names, tag:TAG, or all; of other suites SUITE:NAME")
     add("--episodes", type=cli.positive_int, default=60, metavar="N", help="number of decisions (default: %(default)s)")
     add("--policies", nargs="+", metavar="NAME", help="policies to choose from (default: all there are)")
     add("--selector", default="ppo", metavar="NAME", help="ppo, epsilon_greedy, random, fixed:POLICY ... (default: %(default)s)")
@@ -83,45 +82,44 @@ def parser() -> cli.Parser:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from osel_sim.episodes.drivers import choose_policies, with_fallbacks
-    from osel_sim.formats.levels import parse_axes, resolve, split_off
-    from osel_sim.formats.run_config import check_folder, environment, start_or_resume
+    from osel_sim.episodes.drivers import choose_policies, left_out, with_fallbacks
+    from osel_sim.formats.levels import parse_axes
+    from osel_sim.formats.run_config import check_folder, start_or_resume
+    from osel_sim.suites.ran_with import ran_with
+    from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
     if options.tensorboard:
         from osel_sim.episodes.tensorboard import check_installed
 
         check_installed()
-    tasks = library.select_tasks(options.task, options.tasks)
-    policies = choose_policies(options.policies, options.policies_dir)
+    tasks = select_tasks(options.task, options.tasks)
+    specification = common_specification(tasks)
+    policies = choose_policies(options.policies, specification, options.policies_dir)
+    if options.policies is None and (others := left_out(specification, options.policies_dir)):
+        print(f"not made for the environment of {specification.name}, and left out: {', '.join(others)} (--policies NAME says why)", file=sys.stderr)
     everyone = with_fallbacks(policies, options.policies_dir)
     weights = weights_of(options)[0]
     _check_selector(options.selector, [spec.name for spec in policies], warm=options.warm_start is not None)
-    folder = (
-        options.out
-        or Path("runs") / f"{'-'.join(name.replace(':', '-') for name in options.task)}-{options.selector.replace(':', '-')}-s{options.seed}"
-    )
-    axes = parse_axes(options.axis)
-    above = sorted(
-        {label for label in (split_off(resolve(level, axes, task.axes, task.name))[1] for task in tasks for level in options.level) if label}
-    )
+    names = "-".join((*options.task, options.selector)).replace(":", "-").replace("/", "-")
+    folder = options.out or Path("runs") / f"{names}-s{options.seed}"
+    axes = parse_axes(options.axis, known_axes(tasks))
+    above = sorted({label for task in tasks for level in options.level if (label := task.instance(0, level, options.split, axes).axes)})
     configuration = _configuration(options, above, tasks, policies, everyone, weights)
     check_folder(folder, configuration, options.resume)
 
     from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
-    from osel_sim.sim.gl import choose_backend
 
     encoder = load_encoder(options.encoder or DEFAULT_ENCODER)
     configuration["encoder"] = encoder.identity
     seen = _log(options.warm_start, encoder.identity, policies) if options.warm_start else None
-    ran_with = environment(choose_backend(), content.root())
+    machine = ran_with(tasks)  # probes for a display before anything heavy is loaded
 
     import torch
 
-    from osel_sim.context.cache import ContextCache
     from osel_sim.episodes.drivers import Drivers
     from osel_sim.episodes.live import LiveOptions, LiveRun
+    from osel_sim.reporting.live_page import LivePage
     from osel_sim.selection.registry import make_selector
-    from osel_sim.sim.task_envs import TaskEnvs
 
     # The last bits of a matrix product depend on the number of threads; one, so that a run does not depend on how many there are.
     torch.set_num_threads(1)
@@ -131,34 +129,34 @@ def _run(options: argparse.Namespace) -> int:
     selector = make_selector(options.selector, [spec.name for spec in policies], encoder.dimension, options.seed, **known)
     print(f"{_title(tasks)}: loading {', '.join(spec.name for spec in everyone)}, starting servers ...", file=sys.stderr)
     with contextlib.ExitStack() as stack:
-        drivers = stack.enter_context(Drivers(everyone))
-        envs = stack.enter_context(contextlib.closing(TaskEnvs(tasks)))
+        drivers = stack.enter_context(Drivers(everyone, specification))
         # Only now, when all that could be missing is there, is the folder taken into use.
-        for warning in start_or_resume(folder, configuration, ran_with, options.resume):
+        for warning in start_or_resume(folder, configuration, machine, options.resume):
             print(f"warning: {warning}", file=sys.stderr)
-        live_options = LiveOptions(
-            options.seed, tuple(options.level), options.split, options.counterfactual, _filmed(options), options.realtime, axes, options.action_noise
-        )
-        live = LiveRun(folder, tasks, envs, encoder, ContextCache(folder), drivers, selector, weights, live_options)
-        stack.callback(live.close)
+        live_options = LiveOptions(options.seed, weights, tuple(options.level), options.split, options.counterfactual, axes, options.action_noise)
+        subscribers, page = _subscribers(options, folder), LivePage()
+        live = stack.enter_context(contextlib.closing(LiveRun(folder, tasks, encoder, drivers, selector, live_options, [*subscribers, page])))
         if seen is not None:
             _start_warm(live, seen, options.episodes, options.seed)
         live.replay()
-        board = None
-        if options.tensorboard:
-            from osel_sim.episodes.tensorboard import TensorBoard
-
-            board = stack.enter_context(TensorBoard(folder))
-            board.update(live)
-        interrupted = _decide_all(live, options.episodes, board)
-    _report(live, options.selector)
+        interrupted = _decide_all(live, options.episodes)
+    _report(live, options.selector, page)
     return cli.INTERRUPTED if interrupted else 0
 
 
-def _decide_all(live: "LiveRun", episodes: int, board: "TensorBoard | None") -> bool:
-    """Make all decisions, with a progress bar. Returns whether Ctrl-C ended it: the decision at hand is finished first."""
-    from tqdm import tqdm  # type: ignore[import-untyped]
+def _subscribers(options: argparse.Namespace, folder: Path) -> "list[RunSubscriber]":
+    """What watches the run."""
+    from osel_sim.episodes.progress import Progress
+    from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
+    from osel_sim.episodes.tensorboard import TensorBoard
 
+    wanted = [(options.realtime, Paced), (options.tensorboard, TensorBoard)]
+    films = [Films(folder, _filmed(options))] if options.video else []
+    return [TimingFile(), *films, *(make() for asked, make in wanted if asked), Progress(options.episodes)]
+
+
+def _decide_all(live: "LiveRun", episodes: int) -> bool:
+    """Make all decisions. Returns whether Ctrl-C ended it: the decision at hand is finished first."""
     interrupted = False
 
     def interrupt(*_: object) -> None:
@@ -169,35 +167,18 @@ def _decide_all(live: "LiveRun", episodes: int, board: "TensorBoard | None") -> 
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:
-        with tqdm(total=episodes, initial=len(live.decisions), unit="episode", dynamic_ncols=True) as bar:
-            while len(live.decisions) < episodes and not interrupted:
-                live.decide()
-                if board is not None:
-                    board.update(live)
-                bar.set_postfix_str(_progress(live), refresh=False)
-                bar.update()
+        live.run(episodes, lambda: interrupted)
     finally:
         signal.signal(signal.SIGINT, before)
-    return interrupted
+    return interrupted and len(live.decisions) < episodes
 
 
-def _progress(live: "LiveRun") -> str:
-    decisions = live.decisions
-    rewards = [decision.reward for decision in decisions if decision.reward is not None]
-    successes = [decision.success for decision in decisions if decision.error is None]
-    shares = (f"{name} {100 * sum(decision.policy == name for decision in decisions) / len(decisions):.0f}%" for name in live.selector.policies)
-    mean = (f"reward {sum(rewards) / len(rewards):.3f}, success {100 * sum(successes) / len(successes):.0f}%",) if rewards else ()
-    return ", ".join((*mean, *shares))
-
-
-def _report(live: "LiveRun", selector: str) -> None:
-    """Write summary, curve, page and the selector's state, and print the table."""
+def _report(live: "LiveRun", selector: str, page: "LivePage") -> None:
+    """Write summary, curve and the selector's state, and print the table."""
     from osel_sim.cli.console import console, run_table
     from osel_sim.core.files import write_json
     from osel_sim.figures import learning_curve
     from osel_sim.formats.summary import summarise
-    from osel_sim.reporting.page import write_page
-    from osel_sim.reporting.run_page import run_page
     from osel_sim.selection.state import save_state
 
     if not live.decisions:
@@ -214,13 +195,9 @@ def _report(live: "LiveRun", selector: str) -> None:
     console().print(run_table(summary))
     for decision in [decision for decision in live.decisions if decision.error][:3]:
         print(f"error in episode {decision.index}: {decision.error}", file=sys.stderr)
-    try:
-        write_page(run_page(live.folder), live.folder)
-    except OselError as problem:  # the run itself is complete; python -m osel_sim.report tries again
-        print(f"warning: no report.html: {problem}", file=sys.stderr)
-        print(f"written to {live.folder}")
-    else:
-        print(f"written to {live.folder}; report.html shows it")
+    if page.problem is not None:
+        print(f"warning: no report.html: {page.problem}", file=sys.stderr)
+    print(f"written to {live.folder}" + ("; report.html shows it" if page.problem is None else ""))
 
 
 def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:
@@ -245,7 +222,7 @@ def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:
 
 
 def _declared(
-    selector: str, tasks: "list[TaskSpec]", policies: "list[PolicySpec]", weights: "RewardWeights", encoder: "Encoder", extra: Path | None
+    selector: str, tasks: "list[Task]", policies: "list[PolicySpec]", weights: "RewardWeights", encoder: "Encoder", extra: Path | None
 ) -> dict[str, Any]:
     """Settings by which a selector is told what policies declare, as far as it wants to know: what they cost, and what they were made for.
 
@@ -259,8 +236,8 @@ def _declared(
     wanted, known = setting_names(selector), dict[str, Any]()
     if "expected_costs" in wanted:
         # Half of the horizon is about what a success takes; how costs differ from task to task is learned.
-        actions = sum(task.horizon for task in tasks) // (2 * len(tasks))
-        known["expected_costs"] = expected_costs(policies, weights, max(1, actions))
+        actions = sum(task.info.horizon for task in tasks) // (2 * len(tasks))
+        known["expected_costs"] = expected_costs(policies, weights, max(1, actions), tasks[0].specification)
     if "skills" in wanted:
         known["skills"] = declare(policies, encoder, tasks, extra)
     return known
@@ -279,7 +256,7 @@ def _start_warm(live: "LiveRun", log: "LoggedOutcomes", episodes: int, seed: int
 
     own = live.instance_keys(episodes)
     log = log.take([row for row, key in enumerate(log.keys) if key not in own])
-    count = show(live.selector, Beforehand(log.contexts, log.rewards(live.weights)), live.selector.policies, seed)
+    count = show(live.selector, Beforehand(log.contexts, log.rewards(live.options.weights)), live.selector.policies, seed)
     print(f"shown beforehand: {count} outcomes of {len(log)} instances of {log.source}, none of them of this run", file=sys.stderr)
 
 
@@ -298,7 +275,7 @@ def _check_selector(name: str, policies: list[str], warm: bool) -> None:
         check_can_start_warm(kind)
 
 
-def _title(tasks: "Sequence[TaskSpec]") -> str:
+def _title(tasks: "Sequence[Task]") -> str:
     return tasks[0].name if len(tasks) == 1 else f"{len(tasks)} tasks"
 
 
@@ -313,7 +290,7 @@ def _filmed(options: argparse.Namespace) -> frozenset[int]:
 def _configuration(
     options: argparse.Namespace,
     above: list[str],
-    tasks: "list[TaskSpec]",
+    tasks: "list[Task]",
     policies: "list[PolicySpec]",
     everyone: "list[PolicySpec]",
     weights: "RewardWeights",

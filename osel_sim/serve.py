@@ -18,6 +18,7 @@ from osel_sim.core.errors import OselError, UsageError
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
 if TYPE_CHECKING:
+    from osel_sim.interface.environment import EnvironmentSpec
     from osel_sim.remote.server import PolicyServer
 
 GRACE_SECONDS = 2.0  # for an inference that is still running when everything else has stopped
@@ -58,6 +59,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--port", type=int, default=8000, help="port, 0 for a free one (default: %(default)s)")
     parser.add_argument("--token-env", default=TOKEN_VARIABLE, metavar="VARIABLE", help="environment variable with the token (default: %(default)s)")
     parser.add_argument("--policies-dir", type=Path, metavar="DIR", help="folder with policy files of your own")
+    parser.add_argument("--task", metavar="NAME", help="a task that it will drive in, where that is none of ours: SUITE:TASK")
+    parser.add_argument("--environment", metavar="JSON", help="what it will drive, in place of --task (for a program that starts the server)")
     parser.add_argument("--watch-stdin", action="store_true", help="stop when standard input ends (for a program that starts the server)")
     return parser
 
@@ -76,8 +79,9 @@ def _serve(options: argparse.Namespace) -> int:
     if given is None and not is_loopback(options.host):
         raise UsageError(f"--host {options.host} can be reached from other machines: put a token into the environment variable {options.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
-    greeting = Greeting.of(spec)
-    make_session = load_policy(spec)
+    environment = _environment(options)
+    greeting = Greeting.of(spec, environment)
+    make_session = load_policy(spec, environment)
     warm_up(make_session, greeting)
     server = PolicyServer(make_session, greeting, token, options.host, options.port)
 
@@ -88,6 +92,24 @@ def _serve(options: argparse.Namespace) -> int:
 
     _run_until_signal(server, ready)
     return 0
+
+
+def _environment(options: argparse.Namespace) -> "EnvironmentSpec":
+    """What the policy will drive: as given, or as a task has it, or any of our own."""
+    from osel_sim.interface.environment import EnvironmentSpec
+
+    if options.environment is not None:
+        try:
+            return EnvironmentSpec.from_dict(json.loads(options.environment))
+        except ValueError as error:
+            raise UsageError(f"--environment: not JSON ({error})") from None
+    if options.task is not None:
+        from osel_sim.suites.registry import find_task
+
+        return find_task(options.task).specification
+    from osel_sim.sim.specification import specification
+
+    return specification()
 
 
 def _run_until_signal(server: "PolicyServer", ready: Callable[[int], None]) -> None:

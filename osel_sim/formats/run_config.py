@@ -17,22 +17,23 @@ from osel_sim.core import content
 from osel_sim.core.errors import UsageError
 from osel_sim.core.files import digest, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.formats.task_file import TaskSpec
+from osel_sim.interface.suite import Task
 
 SCHEMA_VERSION = 1
 RUN = "run.json"
 LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
 
 
-def environment(gl: str, root: Path) -> dict[str, Any]:
+def environment(gl: str, root: Path, packages: Iterable[str] = ()) -> dict[str, Any]:
     """What a run ran with.
 
     Args:
         gl: the OpenGL backend in use.
         root: folder whose git revision counts.
+        packages: more distributions whose versions count, besides those that every run needs.
     """
     versions = {"python": platform.python_version()}
-    for name in LIBRARIES:
+    for name in (*LIBRARIES, *packages):
         try:
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -53,9 +54,9 @@ def git_revision(root: Path) -> str | None:
         return None
 
 
-def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -> dict[str, str]:
+def content_digests(tasks: Iterable[Task], policies: Iterable[PolicySpec]) -> dict[str, str]:
     """What the files that a run depends on hold: the tasks', the policies', and their checkpoints' where those lie on this machine."""
-    digests = {f"task {task.name}": digest(task.file) for task in tasks}
+    digests = {f"task {task.name}": task.info.digest for task in tasks}
     for spec in policies:
         digests[f"policy {spec.name}"] = digest(spec.file)
         checkpoint = content.resolve_checkpoint(spec.checkpoint) if spec.checkpoint else None

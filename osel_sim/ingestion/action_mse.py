@@ -21,7 +21,8 @@ from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.ingestion.write import Instance, file_digest
 from osel_sim.interface.encoder import Image
-from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
+from osel_sim.interface.policy import Observation
+from osel_sim.sim.specification import ACTION_DIM, STATE_DIM, specification
 
 IMAGES = "observation.images."
 STATE, ACTION = "observation.state", "action"
@@ -159,7 +160,7 @@ def measure(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Se
     from osel_sim.episodes.drivers import Drivers
 
     rows = []
-    with Drivers(specs) as drivers:
+    with Drivers(specs, specification()) as drivers:
         for sample in tqdm(samples, unit="frame", dynamic_ncols=True):
             observation = sample.dataset.observation(sample.frame)
             rows += [measure_one(sample, drivers[spec.name], observation, settings.tolerance) for spec in specs]

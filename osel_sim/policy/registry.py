@@ -1,7 +1,7 @@
 """Kinds of policies by name, imported only when one is made.
 
-A kind is a function `load(spec) -> make_session`: it loads what is heavy (weights) once and returns a cheap factory of policies, each with its
-own state, which may share the weights. Others add a kind through the entry-point group `osel_sim.policies` (`kind = "module:load"`).
+A kind is a function `load(spec, environment) -> make_session`: it loads what is heavy (weights) once and returns a cheap factory of policies, each
+with its own state, which may share the weights. Others add a kind through the entry-point group `osel_sim.policies`.
 """
 
 from collections.abc import Callable
@@ -9,10 +9,12 @@ from importlib.metadata import EntryPoint, entry_points
 
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats.policy_file import PRIVILEGED, PolicySpec
+from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Policy
+from osel_sim.policy.environment_fit import check_environment
 
 MakeSession = Callable[[], Policy]
-Loader = Callable[[PolicySpec], MakeSession]
+Loader = Callable[[PolicySpec, EnvironmentSpec], MakeSession]
 
 GROUP = "osel_sim.policies"
 BUILT_IN = {"lerobot": "osel_sim.policy.lerobot_policy:load"}
@@ -24,20 +26,25 @@ def kinds() -> list[str]:
     return sorted({*BUILT_IN, *SERVERS, *PRIVILEGED, *_plugins()})
 
 
-def load_policy(spec: PolicySpec) -> MakeSession:
+def load_policy(spec: PolicySpec, environment: EnvironmentSpec) -> MakeSession:
     """Load the weights of `spec` and return the factory of its sessions.
 
+    Args:
+        environment: what it will drive.
+
     Raises:
+        ContentError: its file does not fit the environment.
         UnknownNameError: no such kind.
         UsageError: the kind cannot be loaded here.
         CheckpointError: from the kind's own loader.
     """
-    return _loader(spec)(spec)
+    check_environment(spec, environment)
+    return _loader(spec)(spec, environment)
 
 
-def make_policy(spec: PolicySpec) -> Policy:
+def make_policy(spec: PolicySpec, environment: EnvironmentSpec) -> Policy:
     """One policy of `spec`, weights included. Use `load_policy` where several sessions share them."""
-    return load_policy(spec)()
+    return load_policy(spec, environment)()
 
 
 def _loader(spec: PolicySpec) -> Loader:

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.formats.task_file import TaskSpec
-from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM
+from osel_sim.sim.specification import ACTION_DIM, CAMERAS, CONTROL_HZ, STATE_DIM
 
-CAMERAS = ("agentview", "wrist")
 BURST_PROBABILITY = 0.04
 """Chance that a burst of noise starts at a step."""
 BURST_STEPS = (4, 10)

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError
 from osel_sim.formats.task_file import TaskSpec
-
-CAMERA = "agentview"
+from osel_sim.sim.specification import CONTEXT_CAMERA as CAMERA
 
 
 @dataclass(frozen=True)
