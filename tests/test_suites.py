@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -19,10 +20,12 @@ from osel_sim.episodes.start import Start
 from osel_sim.formats.journal import read_journal
 from osel_sim.formats.mapping import Mapping
 from osel_sim.formats.policy_file import load_policy_file
-from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.formats.rollout_log import DECLARED, read_rollouts
 from osel_sim.interface.call import Call
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
+from osel_sim.interface.suite import Task
 from osel_sim.policy.environment_fit import misfits
+from osel_sim.policy.registry import load_policy
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.sim.specification import specification
@@ -130,9 +133,20 @@ def test_what_a_suite_does_not_have_is_refused_by_name():
 # -- what a suite promises ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["toy:reach", "lift"])
+@pytest.mark.parametrize("name", ["toy:reach", pytest.param("lift", marks=pytest.mark.slow)])
 def test_a_suite_keeps_what_it_promises(name):
     check_task(find_task(name))
+
+
+def test_what_the_documentation_shows_is_a_suite():
+    import toy_suite
+
+    blocks = re.findall(r"```python\n(.*?)```", (TOY.parents[1] / "docs" / "suites.md").read_text(), re.DOTALL)
+    shown = dict(vars(toy_suite))
+    for block in blocks:
+        exec(block, shown)
+    assert len(blocks) == 4 and shown["Toy"] is not toy_suite.Toy
+    check_task(Task(shown["Toy"](), "reach"))
 
 
 def test_a_suite_that_forgets_nothing_is_found_out(monkeypatch):
@@ -214,6 +228,18 @@ def test_conventions_are_checked_against_the_environment(conventions, key, probl
     spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), mapping=Mapping(**conventions))
     ((found, words),) = misfits(spec, find_task("toy:reach").specification)
     assert found == key and problem in words
+
+
+def test_an_entry_point_that_takes_no_environment_is_told_so(tmp_path, monkeypatch):
+    info = tmp_path / "old-1.0.dist-info"
+    info.mkdir()
+    (tmp_path / "old_policies.py").write_text("def load(spec):\n    return lambda: None\n")
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: old\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[osel_sim.policies]\nold = old_policies:load\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), kind="old")
+    with pytest.raises(UsageError, match=r"kind 'old': its entry point must be a function load\(spec, environment\)"):
+        load_policy(spec, find_task("toy:reach").specification)
 
 
 def test_quaternions_are_computed_of_an_axis_angle_and_not_known_without():
@@ -481,7 +507,7 @@ def test_it_records_replays_and_reports(execute):
     rows, metadata = read_rollouts(execute.home / "log")
     assert len(rows) == 48 and {row.task for row in rows} == {"toy:reach"} and rows[0].instance == "toy:reach/test/0/0"
     assert all(row.error is None for row in rows) and all(row.success for row in rows if row.policy == "scripted_expert")
-    assert metadata["declared"] == {"toy_greedy": ["toy:hurry"], "toy_reader": ["toy:reach", "toy:hurry"]}
+    assert metadata[DECLARED] == {"toy_greedy": ["toy:hurry"], "toy_reader": ["toy:reach", "toy:hurry"]}
     success = {name: np.mean([row.success for row in rows if row.policy == name]) for name in ("toy_greedy", "toy_reader")}
     assert success["toy_reader"] > success["toy_greedy"] + 0.3
     execute("replay", "log", "--selectors", "auto", "random", "--seeds", 2, "--no-frontier", "--workers", 1, "--out", "replay")

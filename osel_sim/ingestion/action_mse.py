@@ -172,7 +172,7 @@ def measure(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Se
 
 
 def action_mse(actions: NDArray[np.float32], logged: NDArray[np.float32]) -> float:
-    """Mean squared error (T, 7) over the steps that both have, float64 throughout."""
+    """Mean squared error of actions (T, D) over the steps that both have, float64 throughout."""
     steps = min(len(actions), len(logged))
     return float(np.mean(np.square(actions[:steps].astype(np.float64) - logged[:steps])))
 

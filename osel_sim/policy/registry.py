@@ -4,6 +4,7 @@ A kind is a function `load(spec, environment) -> make_session`: it loads what is
 with its own state, which may share the weights. Others add a kind through the entry-point group `osel_sim.policies`.
 """
 
+import inspect
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 
@@ -39,7 +40,12 @@ def load_policy(spec: PolicySpec, environment: EnvironmentSpec) -> MakeSession:
         CheckpointError: from the kind's own loader.
     """
     check_environment(spec, environment)
-    return _loader(spec)(spec, environment)
+    loader = _loader(spec)
+    try:
+        inspect.signature(loader).bind(spec, environment)
+    except TypeError:
+        raise UsageError(f"{spec.file}: kind {spec.kind!r}: its entry point must be a function load(spec, environment)") from None
+    return loader(spec, environment)
 
 
 def make_policy(spec: PolicySpec, environment: EnvironmentSpec) -> Policy:
