@@ -25,7 +25,7 @@ from osel_sim.interface.call import Call
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.suite import Task
 from osel_sim.policy.environment_fit import misfits
-from osel_sim.policy.registry import load_policy
+from osel_sim.policy.registry import session_factory
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.sim.specification import specification
@@ -239,7 +239,7 @@ def test_an_entry_point_that_takes_no_environment_is_told_so(tmp_path, monkeypat
     monkeypatch.syspath_prepend(str(tmp_path))
     spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), kind="old")
     with pytest.raises(UsageError, match=r"kind 'old': its entry point must be a function load\(spec, environment\)"):
-        load_policy(spec, find_task("toy:reach").specification)
+        session_factory(spec, find_task("toy:reach").specification)
 
 
 def test_quaternions_are_computed_of_an_axis_angle_and_not_known_without():
