@@ -284,9 +284,9 @@ def test_an_instruction_is_drawn_to_its_task_where_there_are_several() -> None:
 def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from osel_sim.training.encoder import recipe
     from osel_sim.training.encoder import train as training
-    from osel_sim.training.encoder.train import Settings, train
+    from osel_sim.training.encoder.train import EncoderSettings, train
 
-    settings = Settings(tasks=("pick_place", "sort"), levels=(0, 2), steps=4, scenes=24, test_scenes=12, views=8, texts=8)
+    settings = EncoderSettings(tasks=("pick_place", "sort"), levels=(0, 2), steps=4, scenes=24, test_scenes=12, views=8, texts=8)
     whole = train(settings, tmp_path, tmp_path / "whole")
     batches: list[recipe.Batch] = []
     make_batch = recipe.make_batch
@@ -326,10 +326,10 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
     ],
 )
 def test_settings_are_checked_when_they_are_made(settings: dict[str, Any], says: str) -> None:
-    from osel_sim.training.encoder.train import Settings
+    from osel_sim.training.encoder.train import EncoderSettings
 
     with pytest.raises(UsageError, match=says):
-        Settings(**settings)
+        EncoderSettings(**settings)
 
 
 @pytest.mark.parametrize(
@@ -337,8 +337,8 @@ def test_settings_are_checked_when_they_are_made(settings: dict[str, Any], says:
     [
         (["--encoder", "osel_smal"], "did you mean 'osel_small'"),
         (["--task", "pick_plac"], "did you mean 'pick_place'"),
-        (["--steps", "0"], "steps must be 1 or more, got 0"),
-        (["--minutes", "-1"], "minutes must be more than 0"),
+        (["--steps", "0"], "--steps: must be 1 or more, got 0"),
+        (["--minutes", "-1"], "--minutes: must be more than 0"),
     ],
 )
 def test_wrong_training_arguments_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], says: str) -> None:

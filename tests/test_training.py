@@ -309,7 +309,7 @@ def test_wrong_use_is_one_line(tmp_path: Path, demonstrations: Path, capsys: pyt
     for arguments, words in {
         ("--policy", "local_smal", "--data", str(demonstrations)): "did you mean 'local_small'",
         ("--policy", "local_small", "--data", str(tmp_path / "none")): "osel_sim.collect",
-        ("--policy", "local_small", "--data", str(demonstrations), "--steps", "0"): "--steps must be at least 1",
+        ("--policy", "local_small", "--data", str(demonstrations), "--steps", "0"): "--steps: must be 1 or more, got 0",
         ("--policy", "local_small"): "--data",
         ("--policy", "local_small", "--data", str(demonstrations), "--step", "3"): "did you mean '--steps'?",
         ("--encoder", "osel_small"): "--data",

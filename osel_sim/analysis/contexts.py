@@ -38,6 +38,7 @@ def lay_out(log: LoggedOutcomes, weights: RewardWeights, seed: int = 0, most: in
     places = TSNE(perplexity=min(30.0, len(rows) / 4), init="pca", random_state=seed).fit_transform(part.contexts)
     aspects = {
         "task": part.labels("task"),
+        "robot": part.labels("robot"),
         "object": part.labels("target"),
         "container": part.labels("container"),
         "phrasing": tuple(wording(label) for label in part.labels("phrasing")),

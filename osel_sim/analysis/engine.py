@@ -1,12 +1,9 @@
 """Replays of selectors over streams of a log, in processes; the result does not depend on how many."""
 
-import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain
 from typing import Any
 
@@ -16,8 +13,8 @@ from numpy.typing import NDArray
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.streams import Streams, draw_streams
 from osel_sim.analysis.warm_start import WarmStart, show
-from osel_sim.core.errors import OselError, UsageError
-from osel_sim.core.processes import end_with_parent
+from osel_sim.core.errors import UsageError, WorkerError
+from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
 from osel_sim.interface.selector import Selector
 from osel_sim.selection.reward import RewardWeights
@@ -161,37 +158,17 @@ def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tu
             for job in jobs:
                 yield _replay_job(material, job)
         return
-    context = multiprocessing.get_context("spawn")  # a forked torch or numba is a hang waiting to happen
-    with ProcessPoolExecutor(workers, context, _prepare, (material,)) as pool:
-        try:
-            for future in as_completed([pool.submit(_in_worker, job) for job in jobs]):
-                yield future.result()
-        except BrokenProcessPool:
-            raise OselError("a worker process of the replay died (out of memory?); try --workers 1") from None
-        except BaseException:
-            # Otherwise leaving the pool waits for the replays that are running.
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+    with closing(run_jobs(partial(_replayer, material), jobs, workers)) as events:
+        for event in events:
+            if isinstance(event, Lost):
+                raise event.error or WorkerError(f"a worker process of the replay died twice ({event.cause}; out of memory?); try --workers 1")
+            yield event.value
 
 
-_material: _Material | None = None
-
-
-def _prepare(material: _Material) -> None:
-    """Make a worker ready."""
-    global _material
-    end_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C: end without a word, the parent says what there is to say
+def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int8]]]:
+    """What a worker does."""
     _limit_threads()
-    _material = material
-
-
-def _in_worker(job: _Job) -> tuple[_Job, NDArray[np.int8]]:
-    if _material is None:
-        raise OselError("a worker process of the replay was not prepared")
-    return _replay_job(_material, job)
+    return lambda job, _: [_replay_job(material, job)]
 
 
 def _replay_job(material: _Material, job: _Job, factory: Factory | None = None) -> tuple[_Job, NDArray[np.int8]]:

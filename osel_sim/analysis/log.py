@@ -1,7 +1,7 @@
 """A rollout log as arrays: what every policy did on every instance, and the instances' contexts."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts
+from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.selection.reward import RewardWeights, combined, counted_time, total_seconds
 from osel_sim.selection.skills import Skills
 
@@ -23,7 +24,11 @@ MEASURES = ("success", "subgoals", "score", "steps", "upload", "inference", "dow
 
 @dataclass(frozen=True)
 class LoggedInstance:
-    """What an instance was about; a log from elsewhere may lack all but key and task."""
+    """What an instance was about; a log from elsewhere may lack all but key and task.
+
+    Attributes:
+        robot: None where all of the log are the usual one's, or there is none.
+    """
 
     key: str
     task: str
@@ -34,6 +39,7 @@ class LoggedInstance:
     seed: int | None = None
     level: int | None = None
     split: str | None = None
+    robot: str | None = None
 
     @property
     def half(self) -> Half:
@@ -203,7 +209,17 @@ def read_log(folder: Path, encoder: str | None = None) -> LoggedOutcomes:
     identity, contexts = read_contexts(folder, tuple(instances), encoder or metadata.get("encoder"))
     arrays, errors = dense(folder, rows, tuple(instances), policies)
     skills = read_skills(folder, identity, metadata.get(DECLARED))
-    return LoggedOutcomes(folder, tuple(instances.values()), policies, contexts, identity, **arrays, errors=errors, metadata=metadata, skills=skills)
+    return LoggedOutcomes(
+        folder, named_robots(instances.values()), policies, contexts, identity, **arrays, errors=errors, metadata=metadata, skills=skills
+    )
+
+
+def named_robots(instances: Iterable[LoggedInstance]) -> tuple[LoggedInstance, ...]:
+    """The instances, the usual robot named as well where there is another one."""
+    found = tuple(instances)
+    if not any(instance.robot for instance in found):
+        return found
+    return tuple(replace(instance, robot=instance.robot or DEFAULT_ROBOT) for instance in found)
 
 
 def read_contexts(folder: Path, instances: Sequence[str], encoder: str | None) -> tuple[str, NDArray[np.float32]]:
@@ -286,4 +302,4 @@ def dense(source: Path, rows: Sequence[Row], instances: Sequence[str], policies:
 
 
 def _instance(row: Row) -> LoggedInstance:
-    return LoggedInstance(row.instance, row.task, row.instruction, row.phrasing, row.target, row.container, row.seed, row.level, row.split)
+    return LoggedInstance(row.instance, row.task, row.instruction, row.phrasing, row.target, row.container, row.seed, row.level, row.split, row.robot)

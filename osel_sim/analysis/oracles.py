@@ -16,7 +16,7 @@ from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
 
-GROUPINGS = ("task", "target", "container", "phrasing")
+GROUPINGS = ("task", "target", "container", "phrasing", "robot")
 """Attributes of an instance that the predictable oracle may know."""
 
 SHRINK = 4.0

@@ -29,6 +29,8 @@ class CollectConfig(Settings):
     """how hard scenes are perturbed, 0 to 3; several take turns"""
     axis: Annotated[Names, INSTANCES] = ()
     """AXIS=LEVEL: one axis at a level of its own, such as camera=2; repeatable"""
+    robot: Annotated[str | None, INSTANCES] = None
+    """robot that does it, such as UR5e (default: the one the task file names, else Panda)"""
     tasks: Annotated[Folder | None, CONTENT] = None
     """folder with task files of your own"""
 
@@ -58,12 +60,14 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
     """
     from osel_sim.formats.levels import parse_axes, resolve
     from osel_sim.formats.library import select_tasks
+    from osel_sim.interface.robot import DEFAULT_ROBOT
+    from osel_sim.sim.robots import with_robot
     from osel_sim.training import collection
 
     config = CollectConfig.of(**values) if config is None else config.changed(**values)
     if config.episodes is None or config.out is None:
         raise SettingError("out" if config.out is None else "episodes", "is missing")
-    tasks = select_tasks(config.task, config.tasks)
+    tasks = with_robot(select_tasks(config.task, config.tasks), config.robot)
     axes = parse_axes(config.axis)
     outs = [config.out] if len(tasks) == 1 else [config.out / task.name for task in tasks]
     for task, out in zip(tasks, outs, strict=True):
@@ -74,6 +78,7 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
     done = []
     for task, out in zip(tasks, outs, strict=True):
         kind = {"task": task.name, "task_version": task.version, "levels": list(config.level), "axes": axes, "image_size": config.image_size}
+        kind |= {"robot": None if task.robot == DEFAULT_ROBOT else task.robot}
         collection.check_settings(collection.shards_folder(out), kind)
         if collection.seeds(out) == config.episodes:
             done.append(f"{out} is complete")  # and stays as it is: training tells datasets apart by when their files were written, too

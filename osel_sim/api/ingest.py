@@ -155,11 +155,13 @@ def _refuse(config: IngestConfig, names: Sequence[str], with_what: str) -> None:
 
 
 def _table(config: IngestConfig, out: Path) -> IngestResult:
-    from osel_sim.context.encoder import DEFAULT_ENCODER
-    from osel_sim.context.text_encoders import TFIDF, load_log_encoder
+    from osel_sim.context.encoder import load_log_encoder
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.text_encoders import TFIDF
+    from osel_sim.core.files import file_digest
     from osel_sim.ingestion.convert import convert
     from osel_sim.ingestion.readers import read_tables
-    from osel_sim.ingestion.write import IngestedInstance, check_out, file_digest, load_image, write_log
+    from osel_sim.ingestion.write import IngestedInstance, check_out, load_image, write_log
 
     start = time.perf_counter()
     mapping = _mapping(config, out)
@@ -195,16 +197,18 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
 
 
 def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
-    from osel_sim.context.encoder import DEFAULT_ENCODER
-    from osel_sim.context.text_encoders import TFIDF, load_log_encoder
+    from osel_sim.context.encoder import load_log_encoder
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.text_encoders import TFIDF
     from osel_sim.episodes.drivers import choose_policies
     from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
+    from osel_sim.sim.specification import specification
 
     start = time.perf_counter()
     if not config.dataset:
         raise SettingError("dataset", "is missing: give the folder of a LeRobotDataset")
-    specs = choose_policies(config.policies, config.policies_dir)
+    specs = choose_policies(config.policies, specification(), config.policies_dir)
     cameras = {}
     for item in config.camera or ():
         camera, equals, column = item.partition("=")

@@ -27,7 +27,7 @@ class RecordConfig(InstanceSettings, ContentSettings):
     """Run every policy on the same instances and write the outcomes to a rollout log."""
 
     task: Annotated[Names, MAIN] = ()
-    """which tasks: names, tag:TAG, or all"""
+    """which tasks: names, tag:TAG, or all; of other suites SUITE:NAME"""
     policies: Annotated[Names | None, MAIN] = None
     """policies to run (default: all there are)"""
     instances: Annotated[Count, MAIN] = 200
@@ -70,12 +70,11 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
 
 def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordResult:
     from osel_sim.context.encoder import load_encoder
-    from osel_sim.core import content
     from osel_sim.core.files import read_json, write_json
     from osel_sim.episodes.declared_skills import declare
     from osel_sim.episodes.recording import Recording
-    from osel_sim.formats.run_config import RUN, check_run_folder, environment, start_or_resume
-    from osel_sim.sim.gl import choose_backend
+    from osel_sim.formats.run_config import RUN, check_run_folder, start_or_resume
+    from osel_sim.suites.ran_with import ran_with
 
     plan = _plan(config)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
@@ -87,7 +86,7 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
     configuration["encoder"] = encoder.identity
     # An encoder that was given is added; the one that was there must not have changed.
     known["encoder"] = before.get("configuration", {}).get("encoder") if before and encoder_given else encoder.identity
-    for warning in start_or_resume(folder, known, environment(choose_backend(), content.root()), config.resume, config.to_json()):
+    for warning in start_or_resume(folder, known, ran_with(plan.tasks), config.resume, config.to_json()):
         logger.warning(warning)
     recording = Recording(folder, plan, encoder.identity, skills)
     if recording.complete:
@@ -102,19 +101,28 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
             (folder / RUN).unlink() if before is None else write_json(folder / RUN, before)
         raise
     recording.finish(configuration)
+    if lost := recording.lost:
+        logger.warning(
+            "%d episodes were lost, the first of them of %s, policy %s (%s); --resume --out %s records them again",
+            *(len(lost), lost[0].instance, lost[0].policy, lost[0].error, folder),
+        )
     return RecordResult(folder, done, seconds)
 
 
 def _plan(config: RecordConfig) -> "Plan":
-    from osel_sim.context.encoder import DEFAULT_ENCODER
-    from osel_sim.episodes.drivers import choose_policies, with_fallbacks
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.episodes.drivers import choose_policies, left_out, with_fallbacks
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.formats.library import select_tasks
+    from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
-    policies = choose_policies(config.policies, config.policies_dir)
+    tasks = select_tasks(config.task, config.tasks, config.robot)
+    environment = common_specification(tasks)
+    policies = choose_policies(config.policies, environment, config.policies_dir)
+    if config.policies is None and (others := left_out(environment, config.policies_dir)):
+        logger.info("not made for the environment of %s, and left out: %s (--policies NAME says why)", environment.name, ", ".join(others))
     return Plan(
-        tasks=tuple(select_tasks(config.task, config.tasks)),
+        tasks=tuple(tasks),
         policies=tuple(policies),
         everyone=tuple(with_fallbacks(policies, config.policies_dir)),
         seeds=range(config.start_seed, config.start_seed + config.instances),
@@ -123,18 +131,19 @@ def _plan(config: RecordConfig) -> "Plan":
         encoder=config.encoder or DEFAULT_ENCODER,
         repeats=config.repeats or 1,
         repeat_every=config.repeat_every or 1,
-        axes=parse_axes(config.axis),
+        axes=parse_axes(config.axis, known_axes(tasks)),
         action_noise=config.action_noise,
     )
 
 
 def _configuration(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
     """Everything the rollout log depends on but the encoder, content of files included."""
-    from osel_sim.formats.run_config import content_digests
+    from osel_sim.formats.run_config import content_digests, robots_said
 
     return {
         "tasks": [task.name for task in plan.tasks],
         "policies": [spec.name for spec in plan.policies],
+        **robots_said(plan.tasks),
         "instances": config.instances,
         "start_seed": config.start_seed,
         "repeats": plan.repeats,
@@ -151,6 +160,7 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
     """The settings that a recording began with; policies, repeats and an encoder that were given come in addition."""
     from osel_sim.core.files import read_json
     from osel_sim.formats.run_config import RUN, check_run_folder
+    from osel_sim.interface.robot import DEFAULT_ROBOT
 
     folder = cast(Path, config.out)
     check_run_folder(folder, {}, resume=True)
@@ -163,6 +173,10 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
             if (list(own) if isinstance(own, tuple) else own) != began[_FIXED[name]]:
                 words = " ".join(map(str, own)) if isinstance(own, tuple) else own
                 raise SettingError(name, f"{words}: {folder / RUN} began with {began[_FIXED[name]]}; leave it out, or give another --out")
+        robot = began.get("robot")
+        if config.robot not in (None, robot or DEFAULT_ROBOT):
+            raise SettingError("robot", f"{config.robot}: {folder / RUN} began with {robot or DEFAULT_ROBOT}; leave it out, or give another --out")
+        values["robot"] = robot if isinstance(robot, str) else None
         values["policies"] = tuple(dict.fromkeys([*began["policies"], *(config.policies or ())]))
         values["encoder"] = config.encoder or began["encoder"].partition("@")[0]
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
@@ -192,8 +206,7 @@ def _as_it_began(configuration: Mapping[str, Any], before: Mapping[str, Any]) ->
 
 def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
     """Record what is not there yet, with a progress bar, and add it. Returns how many episodes, and the seconds they took."""
-    from tqdm.auto import tqdm  # type: ignore[import-untyped]
-
+    from osel_sim.core.progress import progress
     from osel_sim.episodes.workers import record as record_episodes
 
     plan, missing = recording.plan, recording.missing()
@@ -201,7 +214,7 @@ def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
     unit = "episode" if left else "context"
     start = time.perf_counter()
     done = successes = 0
-    with tqdm(total=total if left else len(missing), initial=total - left if left else 0, unit=unit, dynamic_ncols=True) as bar:
+    with progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar:
         for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers):  # contexts alone need no policy
             if recorded is None:
                 bar.update()
@@ -212,5 +225,5 @@ def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
                 continue
             done += len(rows)
             successes += sum(row.success for row in rows)
-            bar.set_postfix_str(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h", refresh=False)
+            bar.note(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h")
     return done, time.perf_counter() - start

@@ -136,6 +136,7 @@ class _Replay:
         from osel_sim.analysis.engine import replay as replay_streams
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import build, tables, with_fixed
+        from osel_sim.core.progress import progress
         from osel_sim.formats.replay_result import write_replay
 
         config = self.config
@@ -144,7 +145,7 @@ class _Replay:
         here = setup(weights)
         best = oracles(log, weights)
         decisions = len(log) if config.decisions is None else config.decisions
-        with _bar(total=len(selectors) * config.seeds * decisions) as bar:
+        with progress(len(selectors) * config.seeds * decisions, "decision", scale=True) as bar:
             (chosen,) = replay_streams(
                 log, [here], selectors, range(config.seeds), config.decisions, config.workers, bar.update, factories=self.factories
             )
@@ -214,21 +215,17 @@ class _Replay:
         self, log: "LoggedOutcomes", setup: "Callable[[RewardWeights], Setup]", weights: "RewardWeights", learners: Sequence[str]
     ) -> dict[str, Any] | None:
         from osel_sim.analysis.frontier import selector_frontiers
+        from osel_sim.core.progress import progress
 
         config = self.config
         if not learners:
             return None
-        with _bar(desc="at other weights") as bar:
-
-            def show(made: int, total: int) -> None:
-                bar.total = total
-                bar.update(made - bar.n)
-
-            try:
-                return selector_frontiers(log, setup, weights, learners, config.seeds, config.decisions, config.workers, show)
-            except DataError as error:
-                logger.warning("no frontier of selectors: %s", error)
-                return None
+        try:
+            with progress(None, "decision", "at other weights", scale=True) as bar:
+                return selector_frontiers(log, setup, weights, learners, config.seeds, config.decisions, config.workers, bar.at)
+        except DataError as error:
+            logger.warning("no frontier of selectors: %s", error)
+            return None
 
     def _off_policy(self, live: "LiveLog", weights: "RewardWeights") -> dict[str, Any]:
         """Estimates from a live run's propensities."""
@@ -237,12 +234,6 @@ class _Replay:
         if self.config.policies or self.config.half:
             raise UsageError("--policies and --half are for rollout logs: a live run is evaluated as it was made")
         return evaluate(live, weights)
-
-
-def _bar(**more: Any) -> Any:
-    from tqdm.auto import tqdm  # type: ignore[import-untyped]
-
-    return tqdm(unit="decision", unit_scale=True, dynamic_ncols=True, **more)
 
 
 def _told(setup: "Setup") -> dict[str, Any]:

@@ -207,3 +207,5 @@ class InstanceSettings(Settings):
     """standard deviation of noise on the motions of every action, in units of action; 1 is 5 cm or half a radian"""
     split: Annotated[Split, INSTANCES] = "test"
     """which instances"""
+    robot: Annotated[str | None, INSTANCES] = None
+    """robot that does all of them, such as UR5e (default: the one each task file names, else Panda)"""

@@ -154,7 +154,7 @@ def train_encoder(config: EncoderTrainConfig | None = None, /, **values: Any) ->
     Raises:
         OselError: whatever is wrong with the settings or the folder; the message says what.
     """
-    from osel_sim.context.encoder import DEFAULT_ENCODER
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
     from osel_sim.formats.library import select_tasks
     from osel_sim.training.encoder import train as encoder_training
 
@@ -164,6 +164,6 @@ def train_encoder(config: EncoderTrainConfig | None = None, /, **values: Any) ->
     if config.data is None:
         raise SettingError("data", "is missing: give the folder of rendered scenes")
     tasks = tuple(task.name for task in select_tasks(config.task))
-    wanted = encoder_training.Settings(tasks, tuple(config.level), config.steps, config.seed, config.scenes, config.test_scenes)
+    wanted = encoder_training.EncoderSettings(tasks, tuple(config.level), config.steps, config.seed, config.scenes, config.test_scenes)
     out = config.out or config.data / config.encoder
     return out, encoder_training.train(wanted, config.data, out, config.minutes, config.device, config.resume)

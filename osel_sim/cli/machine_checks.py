@@ -1,7 +1,6 @@
-"""What `doctor` looks at: Python, packages, display, machine, tasks, policies and the encoder."""
+"""What `doctor` looks at: Python, packages, display, machine, tasks, suites, policies and the encoder."""
 
 import importlib.metadata
-import json
 import os
 import platform
 import shutil
@@ -11,10 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from osel_sim.core import content
-from osel_sim.core.errors import ContentError, DisplayError
+from osel_sim.core.errors import ContentError, DataError, DisplayError, OselError
+from osel_sim.core.files import read_json
 from osel_sim.core.shown import shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.interface.suite import OURS
+from osel_sim.policy.environment_fit import misfits
+from osel_sim.sim.robots import with_robot
+from osel_sim.sim.specification import specification
+from osel_sim.suites.registry import load_suite, suite_names
 
 DISTRIBUTION = "osel-sim"
 CONFIG = "config.json"
@@ -48,7 +53,7 @@ def examine(tasks: Path | None = None, policies: Path | None = None) -> list[Che
         tasks: a folder of the user's own task files.
         policies: a folder of the user's own policy files.
     """
-    return [*_python(), *_packages(), *_display(), *_machine(), *_tasks(tasks), *_policies(policies), *_encoder()]
+    return [*_python(), *_packages(), *_display(), *_machine(), *_tasks(tasks), *_suites(), *_policies(policies), *_encoder()]
 
 
 def _python() -> Iterator[Check]:
@@ -145,9 +150,20 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
         yield Check("tasks", "none", f"no task file in {content.root() / 'tasks'}", MISSING, _install(DISTRIBUTION))
     for name, file in found.items():
         try:
-            yield Check("tasks", name, load_task_file(file).title)
+            yield Check("tasks", name, with_robot([load_task_file(file)])[0].title)
         except ContentError as error:
             yield Check("tasks", name, str(error), MISSING, f"correct {file.name}")
+
+
+def _suites() -> Iterator[Check]:
+    """Suites of others that are installed; nothing of ours needs one."""
+    for name in suite_names():
+        if name != OURS:
+            try:
+                suite = load_suite(name)
+                yield Check("suites", name, f"{suite.spec.title}, {len(suite.tasks)} tasks")
+            except OselError as error:
+                yield Check("suites", name, str(error), NOTE)
 
 
 def _policies(folder: Path | None) -> Iterator[Check]:
@@ -156,7 +172,10 @@ def _policies(folder: Path | None) -> Iterator[Check]:
         yield Check("policies", "none", f"no policy file in {content.root() / 'policies'}", MISSING, _install(DISTRIBUTION))
     for name, file in found.items():
         try:
-            yield _checkpoint(load_policy_file(file))
+            spec = load_policy_file(file)
+            yield _checkpoint(spec)
+            for key, problem in misfits(spec, specification()):
+                yield Check("policies", name, f"is for other suites than ours, or wrong: {key}: {problem}", NOTE)
         except ContentError as error:
             yield Check("policies", name, str(error), MISSING, f"correct {file.name}")
 
@@ -177,7 +196,7 @@ def _checkpoint(policy: PolicySpec) -> Check:
 
 
 def _encoder() -> Iterator[Check]:
-    from osel_sim.context.encoder import DEFAULT_ENCODER
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
 
     folder = content.root() / "assets" / "encoders" / DEFAULT_ENCODER
     train = f"python -m osel_sim.train --encoder --data DIR --out {folder}"
@@ -192,8 +211,8 @@ def _weights(area: str, name: str, folder: Path, fix: str, config: str = CONFIG)
     from safetensors import SafetensorError, safe_open
 
     try:
-        json.loads((folder / config).read_bytes())
-    except (OSError, ValueError):
+        read_json(folder / config)
+    except DataError:
         return Check(area, name, f"{config} in {folder} is missing or no JSON", MISSING, fix)
     # Processors keep their statistics in safetensors files of their own.
     files = sorted(file for file in folder.glob("*.safetensors") if "processor" not in file.name)

@@ -11,17 +11,19 @@ from rich.table import Table
 from osel_sim.cli.console import number, percent
 from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import Row
+from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.selection.reward import RewardWeights, row_rewards, row_seconds
 from osel_sim.statistics.best import share_of_best
 from osel_sim.statistics.intervals import effective_trials, wilson_interval
 
 SPLITS: dict[str, Callable[[Row], str | None]] = {
     "task": lambda row: row.task,
+    "robot": lambda row: row.robot or DEFAULT_ROBOT,
     "level": lambda row: None if row.level is None else label(row.level, row.axes),
     "task at level": lambda row: None if row.level is None else f"{row.task} {label(row.level, row.axes)}",
-    "object": lambda row: row.target,
-    "container": lambda row: row.container,
-    "phrasing": lambda row: None if row.phrasing is None else row.phrasing.rpartition("-")[0].replace("_", "-") or row.phrasing,
+    "object": lambda row: row.target or None,
+    "container": lambda row: row.container or None,
+    "phrasing": lambda row: None if not row.phrasing else row.phrasing.rpartition("-")[0].replace("_", "-") or row.phrasing,
 }
 """What the rows are split by; None where a log from elsewhere does not have it."""
 
@@ -108,7 +110,7 @@ def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
             if value is not None:
                 parts[value].append(row)
         kinds[name] = len(parts)
-        if name in ("task", "level") and len(parts) == 1:
+        if name in ("task", "robot", "level") and len(parts) == 1:
             continue  # all the same
         if name == "task at level" and 1 in (kinds["task"], kinds["level"]):
             continue  # shown already

@@ -4,7 +4,6 @@
 is fitted on the texts of the log that it encodes, without outcomes, so it knows which of their words are telling, but not what any word means.
 """
 
-import hashlib
 import importlib
 import importlib.util
 import json
@@ -17,9 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.encoder import OpenClipEncoder, digest, load_encoder
+from osel_sim.context.open_clip_encoder import OpenClipEncoder, digest, load_open_clip
 from osel_sim.context.sentence_files import check_sentence_model
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.files import content_digest, file_digest
 from osel_sim.core.hub import download, offline_if_unreachable
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, trusted, what_failed
 from osel_sim.interface.encoder import Context, Encoder, Image
@@ -123,7 +123,7 @@ class TfidfEncoder:
             self._axes.fit(table)
         self._known: dict[str, Context] = dict(zip(different, self._project(table), strict=True))
         settings = json.dumps([dimension, version("scikit-learn"), different], ensure_ascii=False)
-        self.identity = f"{TFIDF}@{hashlib.sha256(settings.encode()).hexdigest()[:12]}"
+        self.identity = f"{TFIDF}@{content_digest(settings)[:12]}"
 
     def encode(self, images: Sequence[Image], instruction: str) -> Context:
         """Context (d,) float32 of length one, or zero where no word is known."""
@@ -169,14 +169,11 @@ def load_text_encoder(name: str, device: str = "cpu", texts: Sequence[str] | Non
         texts: all texts of a log, which `tfidf` is fitted on.
 
     Raises:
-        UsageError: `tfidf` without texts, or the first of a pair is no open_clip encoder; otherwise as the encoders themselves.
+        UsageError: `tfidf` without texts; otherwise as the encoders themselves.
     """
     images, plus, text = name.rpartition("+") if name.endswith(f"+{TFIDF}") else _split(name)
     if plus:
-        pictures = load_encoder(images, device)
-        if not isinstance(pictures, OpenClipEncoder):
-            raise UsageError(f"encoder {name!r}: {images!r} is no open_clip encoder, of which the image half could be taken")
-        return ImagesAndText(pictures, load_text_encoder(text, device, texts))
+        return ImagesAndText(load_open_clip(images, device), load_text_encoder(text, device, texts))
     if text.startswith(SENTENCE):
         return SentenceEncoder(text, device)
     if text != TFIDF:
@@ -184,20 +181,6 @@ def load_text_encoder(name: str, device: str = "cpu", texts: Sequence[str] | Non
     if texts is None:
         raise UsageError(f"encoder {TFIDF!r} is fitted on the texts of a log, so only python -m osel_sim.ingest can use it")
     return TfidfEncoder(texts)
-
-
-def load_log_encoder(name: str, texts: Sequence[str], with_images: bool, device: str = "cpu") -> Encoder:
-    """Load an encoder for a log: of an open_clip encoder only the text half where there are no images.
-
-    Raises:
-        UsageError: an encoder of images for a log without any; otherwise as `load_encoder`.
-    """
-    if name.endswith(TFIDF) or SENTENCE in name:
-        if "+" in name and not with_images and (name.endswith(f"+{TFIDF}") or f"+{SENTENCE}" in name):
-            raise UsageError(f"encoder {name!r} wants images, and there are none; name the part after the + alone")
-        return load_text_encoder(name, device, texts)
-    encoder = load_encoder(name, device)
-    return TextOnly(encoder) if isinstance(encoder, OpenClipEncoder) and not with_images else encoder
 
 
 def _split(name: str) -> tuple[str, str, str]:
@@ -217,7 +200,6 @@ def _folder(model: str) -> Path | None:
     weights = folder / WEIGHTS
     if not weights.is_file():
         return None
-    with weights.open("rb") as handle:
-        if hashlib.file_digest(handle, "sha256").hexdigest() != original:
-            raise CheckpointError(f"{weights}: is not what was published as {model}; remove the package {module.replace('_', '-')}")
+    if file_digest(weights) != original:
+        raise CheckpointError(f"{weights}: is not what was published as {model}; remove the package {module.replace('_', '-')}")
     return folder

@@ -1,7 +1,6 @@
 """Arrays and plain values in one safetensors file, the values as JSON in its metadata. No pickle: reading a file cannot run code."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import write_bytes
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -40,15 +40,9 @@ class TensorFile:
 
         contiguous = {name: np.ascontiguousarray(value) if value.ndim else value for name, value in arrays.items()}
         content = save(contiguous, metadata={"format": self.format, "values": json.dumps(values, sort_keys=True)})
-        temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
         try:
-            with temporary.open("wb") as handle:
-                handle.write(content)
-                handle.flush()
-                os.fsync(handle.fileno())
-            os.replace(temporary, file)
+            write_bytes(file, content, sync=True)
         except OSError as error:
-            temporary.unlink(missing_ok=True)
             raise DataError(f"{file}: {self.what} cannot be written ({error.strerror})") from None
 
     def read(self, file: Path) -> tuple[Arrays, dict[str, Any]]:

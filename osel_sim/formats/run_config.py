@@ -15,24 +15,28 @@ from typing import Any
 
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
-from osel_sim.core.files import digest, read_json, write_json
+from osel_sim.core.files import digest, is_partial, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.formats.task_file import TaskSpec
+from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.interface.suite import OURS, Task
 
 SCHEMA_VERSION = 1
 RUN = "run.json"
+UNSAID = ("robot",)
+"""Keys of a configuration that are left out where they say what is usual; they are compared all the same."""
 LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
 
 
-def environment(gl: str, root: Path) -> dict[str, Any]:
+def environment(gl: str, root: Path, packages: Iterable[str] = ()) -> dict[str, Any]:
     """What a run ran with.
 
     Args:
         gl: the OpenGL backend in use.
         root: folder whose git revision counts.
+        packages: more distributions whose versions count, besides those that every run needs.
     """
     versions = {"python": platform.python_version()}
-    for name in LIBRARIES:
+    for name in (*LIBRARIES, *packages):
         try:
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -53,9 +57,9 @@ def git_revision(root: Path) -> str | None:
         return None
 
 
-def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -> dict[str, str]:
+def content_digests(tasks: Iterable[Task], policies: Iterable[PolicySpec]) -> dict[str, str]:
     """What the files that a run depends on hold: the tasks', the policies', and their checkpoints' where those lie on this machine."""
-    digests = {f"task {task.name}": digest(task.file) for task in tasks}
+    digests = {f"task {task.name}": task.info.digest for task in tasks}
     for spec in policies:
         # A Python object has no file; its class is all that can be said of it.
         digests[f"policy {spec.name}"] = digest(spec.file) if spec.file.is_file() else str(spec.file)
@@ -63,6 +67,13 @@ def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -
         if isinstance(checkpoint, Path):
             digests[f"checkpoint {spec.name}"] = digest(checkpoint)
     return digests
+
+
+def robots_said(tasks: Iterable[Task]) -> dict[str, Any]:
+    """`robot` of a configuration: the one that does all tasks, or the robot of each; nothing where that is the usual one."""
+    robots = {task.name: task.specification.robot for task in tasks if task.suite.spec.name == OURS}
+    names = set(robots.values()) or {DEFAULT_ROBOT}
+    return {"robot": robots if len(names) > 1 else names.pop()} if names != {DEFAULT_ROBOT} else {}
 
 
 def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:
@@ -82,13 +93,14 @@ def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) 
         if resume:
             raise UsageError(f"--resume: there is no run in {folder}; leave --resume out to begin one, or give the folder with --out")
         check_writable(folder)
-        if folder.exists() and any(item.name != "run.partial" for item in folder.iterdir()):
+        if folder.exists() and any(not is_partial(item) for item in folder.iterdir()):
             raise UsageError(f"--out {folder} is not empty and holds no {RUN}; give a new folder")
         return
     if not resume:
         raise UsageError(f"--out {folder} is in use; add --resume to go on with what is in it, or give another folder")
     was = read_json(file).get("configuration", {})
-    _compare(file, {key: was.get(key) for key in configuration}, json.loads(json.dumps(configuration)))
+    now = {**dict.fromkeys(UNSAID), **configuration} if configuration else {}
+    _compare(file, {key: was.get(key) for key in now}, json.loads(json.dumps(now)))
 
 
 def check_writable(folder: Path) -> None:

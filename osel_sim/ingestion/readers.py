@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError, did_you_mean
 from osel_sim.ingestion.mapping import Join, Mapping, flag
 
@@ -207,6 +208,7 @@ def _parquet(file: Path) -> Iterator[Record]:
 
     try:
         names = pyarrow.parquet.read_schema(file).names
+        check_rows(file)
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise DataError(f"{file}: column {twice!r} is there twice")

@@ -70,10 +70,16 @@ def log_sections(log: LoggedOutcomes, weights: RewardWeights, replayed: Replayed
 def log_facts(log: LoggedOutcomes, weights: RewardWeights) -> list[tuple[str, str]]:
     """What a log was made from."""
     facts = [
-        *(("log", str(log.source)), ("tasks", ", ".join(sorted(set(log.labels("task"))))), ("policies", ", ".join(log.policies))),
+        *(("log", str(log.source)), ("tasks", ", ".join(sorted(set(log.labels("task"))))), *_robots(log), ("policies", ", ".join(log.policies))),
         *(("instances", f"{len(log):,}"), ("repeats", str(log.repeats)), ("encoder", log.encoder), ("reward", formula(weights))),
     ]
     return facts + [(name, digest[:12]) for name, digest in dict(log.metadata.get("content") or {}).items()]
+
+
+def _robots(log: LoggedOutcomes) -> list[tuple[str, str]]:
+    """Which robots there are, where it is not the usual one alone."""
+    names = sorted(set(log.labels("robot")) - {""})
+    return [("robots", ", ".join(names))] if names else []
 
 
 def few(names: Sequence[str], most: int = 3) -> str:

@@ -1,7 +1,6 @@
 """One self-contained HTML page from figures, tables and words, with the figures' PNG and SVG and the tables' CSV beside it."""
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -9,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from osel_sim.core.errors import UsageError
+from osel_sim.core.files import write_bytes
 from osel_sim.core.shown import all_shown, shown
 from osel_sim.reporting.description import DARK, LIGHT, Figure, Table
 from osel_sim.reporting.html_tables import to_csv, to_text
@@ -111,9 +111,7 @@ def write_page(page: Page, folder: Path) -> Path:
     for name, content in files.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_name(f".{file.name}.partial")
-        partial.write_bytes(content)
-        os.replace(partial, file)
+        write_bytes(file, content)
     return folder / PAGE
 
 

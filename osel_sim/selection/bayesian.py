@@ -1,6 +1,5 @@
 """Bayesian linear regression of each policy's reward on features of the context, and choosing by it."""
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 
 from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.core.files import content_digest
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.features import Array, Features, Sketch
@@ -236,7 +236,7 @@ class BayesianSelector(SelectorBase):
         if table.ndim != 2 or table.shape[1] != self.context_dim or not len(table) or not np.isfinite(table).all():
             raise UsageError(f"warm_contexts must be a finite table (n, {self.context_dim}), got shape {table.shape}")
         few = table[np.linspace(0, len(table) - 1, min(WARM, len(table))).astype(np.int64)]
-        return self._sketch(few).astype(np.float64), hashlib.sha256(table.tobytes()).hexdigest()
+        return self._sketch(few).astype(np.float64), content_digest(table.tobytes())
 
     def _add_policy(self, name: str) -> None:
         self._costs = np.append(self._costs, self._cost(name))

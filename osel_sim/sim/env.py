@@ -2,17 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.formats.task_file import TaskSpec, load_task_file
-from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM, Observation
+from osel_sim.interface.environment import EnvironmentSpec
+from osel_sim.interface.policy import Observation
 from osel_sim.sim import predicates
 from osel_sim.sim.instance import Instance, make_instance
+from osel_sim.sim.robots import with_robot
+from osel_sim.sim.specification import ACTION_DIM, CONTROL_HZ, STATE_DIM, specification
 from osel_sim.sim.world import Snapshot, World
+
+if TYPE_CHECKING:
+    from osel_sim.sim.expert import Expert
 
 WAITING = 0.0
 """A gripper command of 0 leaves the fingers as they are (only the sign counts)."""
@@ -36,6 +42,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         cameras: images that `reset` and `step` return; none by default, since an image costs more than a step. `observe` renders on demand.
         image_size: pixels, square.
         render_mode: `rgb_array` or None.
+        robot: name of the robot; None: the task's own.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 (gymnasium's own declaration)
@@ -50,6 +57,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         cameras: Sequence[str] = (),
         image_size: int = 96,
         render_mode: str | None = None,
+        robot: str | None = None,
     ) -> None:
         from osel_sim.sim.gl import choose_backend
 
@@ -60,6 +68,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
             task = load_task_file(content.find("tasks", task))
         from osel_sim.sim.cameras import Cameras
 
+        task = with_robot([task], robot)[0]
         self.task = task
         self.split, self.level, self.axes = split, level, dict(axes or {})
         self.cameras, self.image_size = tuple(cameras), image_size
@@ -100,7 +109,12 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         """Give the GL contexts back."""
         self._images.close()
 
-    # -- what the episode loop uses ------------------------------------------------------------------------------------
+    # -- osel_sim.interface.environment: what the episode loop uses ----------------------------------------------------
+
+    @property
+    def specification(self) -> EnvironmentSpec:
+        """What it offers a policy."""
+        return specification(horizon=self.task.horizon)
 
     def load(self, instance: Instance) -> None:
         """Reset to an instance."""
@@ -147,6 +161,12 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         """Success, or the horizon is reached."""
         return self.steps >= self.task.horizon or self.success
 
+    def expert(self) -> "Expert":
+        """The scripted expert, at the beginning of its plan for the loaded instance."""
+        from osel_sim.sim.expert import Expert
+
+        return Expert(self.world)
+
     def entity_positions(self) -> dict[str, NDArray[np.float64]]:
         """World position (3,) of everything in the scene, of its handle where it has one: labels for training, never shown to a policy."""
         return {placement.entity: self.world.landmark(placement.entity).copy() for placement in self.instance.placements}
@@ -155,19 +175,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         """Pixel (x, y) of world points (N, 3) in a square image of a camera -> (N, 2)."""
         from osel_sim.sim.cameras import project
 
-        return project(self.world.model, self.world.data, points, camera, size)
-
-    def camera_pose(self, camera: str, relative_to_gripper: bool) -> dict[str, Any]:
-        """Where a camera is (`osel_sim.training.projection.Pinhole` says what the entries mean)."""
-        from osel_sim.sim.scene import CAMERA_NAMES
-
-        index = self.world.model.camera(CAMERA_NAMES[camera]).id
-        position, rotation = self.world.data.cam_xpos[index], self.world.data.cam_xmat[index].reshape(3, 3)
-        if relative_to_gripper:
-            turn = self.world.grip_matrix.T
-            position, rotation = turn @ (position - self.world.grip_position), turn @ rotation
-        mount = "gripper" if relative_to_gripper else "world"
-        return {"mount": mount, "position": position.tolist(), "rotation": rotation.tolist(), "fovy": float(self.world.model.cam_fovy[index])}
+        return project(self.world.model, self.world.data, points, self._camera(camera), size)
 
     def snapshot(self) -> EnvSnapshot:
         """The state now; `restore` goes on from it to the same bits."""
@@ -185,6 +193,10 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         subgoals = self.task.subgoals
         while self._reached < len(subgoals) and predicates.holds(self.world, subgoals[self._reached][1]):
             self._reached += 1
+
+    def _camera(self, camera: str) -> int:
+        """Index of a camera in the model."""
+        return int(self.world.model.camera(self.world.scene.cameras.get(camera, camera)).id)
 
     def _state(self) -> NDArray[np.float32]:
         world = self.world

@@ -1,6 +1,5 @@
 """Training that begins with the weights of a checkpoint."""
 
-from hashlib import sha256
 from pathlib import Path
 
 import torch
@@ -11,6 +10,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from osel_sim.core.errors import CheckpointError
+from osel_sim.core.files import content_digest
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
 from osel_sim.policy import register
 from osel_sim.policy.perception_step import PerceptionStep
@@ -51,7 +51,7 @@ class Initial:
             if isinstance(step, PerceptionStep):
                 parts = {"policy": self._weights, "perception": step.state_dict()}
                 self._weights = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        self.digest = sha256(b"".join(file.read_bytes() for file in sorted(folder.glob("*.safetensors")))).hexdigest()
+        self.digest = content_digest(*(file.read_bytes() for file in sorted(folder.glob("*.safetensors"))))
 
     def fill(self, trainee: nn.Module, kind: str) -> None:
         """Give a module in training the checkpoint's weights.

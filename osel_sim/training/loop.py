@@ -11,9 +11,9 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from tqdm import tqdm  # type: ignore[import-untyped]
 
 from osel_sim.core.errors import CheckpointError, DataError
+from osel_sim.core.progress import progress
 from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.training.state import (
     FILE,
@@ -141,7 +141,7 @@ class Trainer:
         """
         last = min(self.steps, until or self.steps)
         self._problem.module.train()
-        with tqdm(total=self.steps, initial=self.progress.step, desc=label, unit="step", mininterval=1.0) as bar:
+        with progress(self.steps, "step", label, initial=self.progress.step) as bar:
             for step, batch in self._prefetched(self.progress.step, last):
                 begin = time.perf_counter()
                 report = self._step(step, batch)
@@ -150,7 +150,7 @@ class Trainer:
                 self.progress.step = step + 1
                 self.progress.seconds += time.perf_counter() - begin
                 bar.update()
-                bar.set_postfix({name: f"{value:.4f}" for name, value in self.progress.losses.items()}, refresh=False)
+                bar.note(", ".join(f"{name}={value:.4f}" for name, value in self.progress.losses.items()))
                 if (step + 1) % save_every == 0 or step + 1 == last:
                     self.save()
                 for interval, call in every.items():

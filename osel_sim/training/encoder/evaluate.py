@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.encoder import OpenClipEncoder, encode_many
+from osel_sim.context.encoder import encode_many
+from osel_sim.context.open_clip_encoder import OpenClipEncoder
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.formats.terms import KINDS
 from osel_sim.training.encoder.captions import NAMINGS, PLACES, Captions

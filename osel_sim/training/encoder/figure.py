@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from osel_sim.context.encoder import DEFAULT_ENCODER, encode_many, load_encoder
+from osel_sim.context.encoder import encode_many, load_encoder
+from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
 from osel_sim.core.content import find
 from osel_sim.core.errors import OselError
 

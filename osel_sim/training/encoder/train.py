@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.context.encoder import DEFAULT_ENCODER, VOCABULARY, WEIGHTS
+from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER, VOCABULARY, WEIGHTS
 from osel_sim.core.errors import UnknownNameError, UsageError
-from osel_sim.core.files import finite, write_json
+from osel_sim.core.files import atomic, finite, write_json
 from osel_sim.formats.levels import LEVELS
 from osel_sim.formats.library import select_tasks
 from osel_sim.formats.task_file import TaskSpec
@@ -24,7 +24,7 @@ WARMUP_STEPS = 100
 
 
 @dataclass(frozen=True)
-class Settings:
+class EncoderSettings:
     """How to train.
 
     Attributes:
@@ -65,7 +65,7 @@ class Settings:
                 raise UnknownNameError("level", str(level), map(str, LEVELS))
 
 
-def train(settings: Settings, data: Path, out: Path, minutes: float | None = None, device: str = "", resume: bool = False) -> dict[str, Any]:
+def train(settings: EncoderSettings, data: Path, out: Path, minutes: float | None = None, device: str = "", resume: bool = False) -> dict[str, Any]:
     """Train, write the open_clip folder `out`, measure what was written on the test split, and return what `training.json` says.
 
     Args:
@@ -82,7 +82,7 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
     import open_clip
     import torch
 
-    from osel_sim.context.encoder import OpenClipEncoder
+    from osel_sim.context.open_clip_encoder import OpenClipEncoder
     from osel_sim.training.encoder import recipe
     from osel_sim.training.encoder.evaluate import measure_all
     from osel_sim.training.encoder.scenes import cached_scenes
@@ -125,7 +125,7 @@ def train(settings: Settings, data: Path, out: Path, minutes: float | None = Non
     return report
 
 
-def _trainer(settings: Settings, model: Any, tasks: list[TaskSpec], scenes: list["Scenes"], device: str, out: Path) -> "Trainer":
+def _trainer(settings: EncoderSettings, model: Any, tasks: list[TaskSpec], scenes: list["Scenes"], device: str, out: Path) -> "Trainer":
     """The model with its readouts, batches and objective."""
     import numpy as np
     import open_clip
@@ -171,6 +171,5 @@ def _save_weights(model: Any, file: Path) -> None:
 
     state = {name: value.detach().cpu() for name, value in model.state_dict().items()}
     halved = {name: value.half() if value.dtype == torch.float32 else value for name, value in state.items()}
-    temporary = file.with_suffix(".tmp")
-    save_file({name: value.contiguous() for name, value in halved.items()}, temporary)
-    temporary.replace(file)
+    with atomic(file) as partial:
+        save_file({name: value.contiguous() for name, value in halved.items()}, partial)
