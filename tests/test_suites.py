@@ -230,16 +230,21 @@ def test_conventions_are_checked_against_the_environment(conventions, key, probl
     assert found == key and problem in words
 
 
-def test_an_entry_point_that_takes_no_environment_is_told_so(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("arguments", "works"), [("spec, environment", True), ("spec", True), ("", False), ("spec, environment, more", False)])
+def test_a_kind_is_told_what_it_drives_if_it_wants_to_know(arguments, works, tmp_path, monkeypatch):
     info = tmp_path / "old-1.0.dist-info"
     info.mkdir()
-    (tmp_path / "old_policies.py").write_text("def load(spec):\n    return lambda: None\n")
+    name = f"policies_with_{len(arguments)}"
+    (tmp_path / f"{name}.py").write_text(f"def load({arguments}):\n    return lambda: None\n")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: old\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[osel_sim.policies]\nold = old_policies:load\n")
+    (info / "entry_points.txt").write_text(f"[osel_sim.policies]\nold = {name}:load\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), kind="old")
+    spec, environment = replace(load_policy_file(POLICIES / "toy_greedy.toml"), kind="old"), find_task("toy:reach").specification
+    if works:
+        assert session_factory(spec, environment)() is None
+        return
     with pytest.raises(UsageError, match=r"kind 'old': its entry point must be a function load\(spec, environment\)"):
-        session_factory(spec, find_task("toy:reach").specification)
+        session_factory(spec, environment)
 
 
 def test_quaternions_are_computed_of_an_axis_angle_and_not_known_without():
