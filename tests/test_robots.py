@@ -19,6 +19,7 @@ from osel_sim.sim.expert import Expert
 from osel_sim.sim.instance import make_instance
 from osel_sim.sim.perturbation import CLEAN
 from osel_sim.sim.robots import BUILT_IN, load_robot, with_robot
+from osel_sim.suites.registry import find_task
 
 TASK = load_task_file(content.find("tasks", "pick_place"))
 OTHERS = sorted(set(BUILT_IN) - {"Panda"})
@@ -187,10 +188,10 @@ def test_an_unknown_robot_is_refused_with_the_nearest():
 
 
 def test_run_json_says_only_what_is_unusual():
-    lift = dataclasses.replace(TASK, name="lift", robot="UR5e")
-    assert robots_said([TASK]) == {}
-    assert robots_said([lift]) == {"robot": "UR5e"}
-    assert robots_said([TASK, lift]) == {"robot": {"pick_place": "Panda", "lift": "UR5e"}}
+    usual, other = find_task("pick_place"), find_task("lift", robot="UR5e")
+    assert robots_said([usual]) == robots_said([find_task("lift", robot="Panda")]) == {}
+    assert robots_said([other]) == {"robot": "UR5e"}
+    assert robots_said([usual, other]) == {"robot": {"pick_place": "Panda", "lift": "UR5e"}}
 
 
 def test_other_packages_offer_robots(tmp_path, monkeypatch):
@@ -198,7 +199,7 @@ def test_other_packages_offer_robots(tmp_path, monkeypatch):
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-robots\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
-        "[osel_sim.robots]\nTheirs = their_robots:THEIRS\nPanda = their_robots:THEIRS\nWrong = their_robots:WRONG\n"
+        "[osel_sim.robots]\nTheirs = their_robots:THEIRS\nPanda = their_robots:THEIRS\nOther = their_robots:THEIRS\nWrong = their_robots:WRONG\n"
     )
     (tmp_path / "their_robots.py").write_text(
         "from dataclasses import replace\nfrom osel_sim.sim.robots.panda import PANDA\nTHEIRS, WRONG = replace(PANDA, name='Theirs'), 1\n"
@@ -207,8 +208,10 @@ def test_other_packages_offer_robots(tmp_path, monkeypatch):
     assert load_robot("Theirs").name == "Theirs"
     assert load_robot("Panda").name == "Panda", "a built-in robot cannot be replaced"
     assert make_instance(with_robot([TASK], "Theirs")[0], 1).key == "pick_place/test/0/1-Theirs"
-    with pytest.raises(UsageError, match="must be a Robot of that name, got 1"):
+    with pytest.raises(UsageError, match="must be a Robot, it is a int"):
         load_robot("Wrong")
+    with pytest.raises(UsageError, match=r"'Other'.* calls itself 'Theirs'"):
+        load_robot("Other")
     sys.modules.pop("their_robots", None)
 
 

@@ -8,12 +8,12 @@ import pytest
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.episodes.expected_costs import expected_costs
 from osel_sim.formats.policy_file import PolicySpec, Price, Remote
-from osel_sim.selection.bayesian import highest
 from osel_sim.selection.features import Components, Landmarks, Sketch
 from osel_sim.selection.kernel_ucb import KernelUCBSelector
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.selection.state import load_state, save_state
+from osel_sim.sim.specification import specification
 
 POLICIES = ("a", "b", "c")
 CONTEXTUAL = ("linucb", "lints", "neural_linear", "auto")
@@ -203,15 +203,6 @@ def test_the_alias_is_the_same_selector():
     assert type(make_selector("auto", POLICIES, 4, 0)) is type(make_selector("kernel_ucb", POLICIES, 4, 0)) is KernelUCBSelector
 
 
-def test_probability_of_being_the_highest():
-    generator = np.random.default_rng(0)
-    means, deviations = np.array([0.1, 0.3, 0.25, -2.0]), np.array([0.3, 0.1, 0.2, 0.3])
-    draws = means + deviations * generator.normal(size=(200_000, 4))
-    frequencies = np.bincount(draws.argmax(axis=1), minlength=4) / len(draws)
-    assert highest(means, deviations) == pytest.approx(frequencies, abs=0.005)
-    assert highest(np.array([1.0, 1.0, 0.0]), np.zeros(3)).tolist() == [0.5, 0.5, 0.0]
-
-
 def test_features_keep_what_matters():
     generator = np.random.default_rng(0)
     contexts = generator.normal(size=(400, 10)) * np.array([5.0, 2.0, 1.0] + [1e-9] * 7)
@@ -244,12 +235,12 @@ def test_costs_declared_by_policy_files():
         spec("near", remote=Remote("ethernet")),
         spec("meanwhile", execute=40, remote=Remote("satellite", "async")),
     ]
-    costs = expected_costs(specs, weights, actions=80)
+    costs = expected_costs(specs, weights, actions=80, environment=specification())
     assert costs["local"] == pytest.approx(0.2 * np.log10(4.0))
     assert costs["paid"] - costs["local"] == pytest.approx(0.01 * (80 * 0.1 + 10 * 1.0))
     assert costs["far"] > costs["near"] > costs["local"]
     assert costs["meanwhile"] == pytest.approx(costs["local"], abs=0.01)
-    in_steps = expected_costs(specs, RewardWeights(0.05, 0.0, "steps"), actions=80)
+    in_steps = expected_costs(specs, RewardWeights(0.05, 0.0, "steps"), actions=80, environment=specification())
     assert in_steps["local"] == pytest.approx(4.0)
     with pytest.raises(UsageError, match="actions"):
-        expected_costs(specs, weights, actions=0)
+        expected_costs(specs, weights, actions=0, environment=specification())

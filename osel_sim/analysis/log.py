@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts
 from osel_sim.interface.robot import DEFAULT_ROBOT
-from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
+from osel_sim.selection.reward import RewardWeights, combined, counted_time, total_seconds
 from osel_sim.selection.skills import Skills
 
 Array = NDArray[np.float64]
@@ -102,9 +102,7 @@ class LoggedOutcomes:
     @property
     def seconds(self) -> Array:
         """Seconds from instruction to end of each episode, (N, P, R), as `osel_sim.selection.reward.total_seconds`; NaN where unknown."""
-        parts = np.stack([self.upload, self.inference, self.download])
-        waiting = np.where(np.isfinite(parts).any(axis=0), np.nansum(parts, axis=0), np.nan)
-        return np.fmax(self.motion, waiting)
+        return total_seconds(self.upload, self.inference, self.download, self.motion)
 
     def rewards(self, weights: RewardWeights) -> Array:
         """Reward of every outcome, (N, P, R), as `osel_sim.selection.reward.reward`; NaN where there is no outcome.
@@ -113,21 +111,16 @@ class LoggedOutcomes:
             DataError: the log has outcomes, but lacks throughout what the weights ask for.
         """
         score: Array = getattr(self, weights.success)
-        # What has no weight is left out, so that a log need not have it.
-        if weights.alpha_time > 0.0:
-            time = self.steps if weights.time_unit == "steps" else np.log10(np.maximum(self.seconds, FLOOR_SECONDS))
-        else:
-            time = np.zeros_like(score)
-        price = self.price if weights.alpha_price > 0.0 else np.zeros_like(score)
+        time, price = counted_time(weights, self.steps, self.seconds), self.price
         ran = np.isfinite(self.success)
-        for name, values, remedy in (
-            (weights.success, score, "choose success instead"),
-            ("times" if weights.time_unit == "log10-seconds" else "steps", time, "give --alpha-time 0"),
-            ("prices", price, "give --alpha-price 0"),
+        for name, values, weight, remedy in (
+            (weights.success, score, 1.0, "choose success instead"),
+            ("times" if weights.time_unit == "log10-seconds" else "steps", time, weights.alpha_time, "give --alpha-time 0"),
+            ("prices", price, weights.alpha_price, "give --alpha-price 0"),
         ):
-            if ran.any() and not np.isfinite(values).any():
+            if weight > 0.0 and ran.any() and not np.isfinite(values).any():
                 raise DataError(f"{self.source}: the log has no {name}, which the reward needs: {remedy}")
-        return np.asarray(score - weights.alpha_time * time - weights.alpha_price * price, np.float64)
+        return combined(weights, score, time, price)
 
     def expected_costs(self, weights: RewardWeights) -> dict[str, float]:
         """What a policy is charged for time and price on average where it succeeds: reward = success - cost.

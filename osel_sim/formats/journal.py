@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim.core.errors import DataError
+from osel_sim.core.shown import escaped
 from osel_sim.interface.outcome import Outcome, Seconds
 
 
@@ -76,7 +77,7 @@ def to_line(data: dict[str, Any]) -> str:
     Raises:
         ValueError: a NaN or infinity, which JSON does not have.
     """
-    return json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(", ", ": ")) + "\n"
+    return escaped(json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(", ", ": "))) + "\n"
 
 
 class Lines:
@@ -118,7 +119,7 @@ def read_lines(file: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
             return
         try:
             data = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise DataError(f"{file}, line {number}: not JSON ({error})") from None
         if not isinstance(data, dict):
             raise DataError(f"{file}, line {number}: expected an object, got {type(data).__name__}")

@@ -1,5 +1,6 @@
 """A policy file: what drives the robot, where it runs, what it needs to see, what it costs."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -8,7 +9,6 @@ from osel_sim.formats.mapping import Mapping, read_mapping
 from osel_sim.formats.validate import Table
 
 NETWORKS = ("none", "ethernet", "wifi", "lte", "satellite")  # the profiles themselves: osel_sim.remote.network
-CAMERAS = ("agentview", "wrist")
 MODES = ("blocking", "async")
 PRIVILEGED = ("scripted_expert",)
 """Kinds that see the simulator's state: a ceiling to compare with, never chosen unless named, and never behind a server."""
@@ -57,7 +57,8 @@ class PolicySpec:
         execute: how many actions of each chunk are executed before it is asked again.
         inference_seconds: declared time of one inference on the virtual clock.
         remote: None for a local policy.
-        skills: tasks that it was made for (names, `tag:TAG` or `all`), for selectors that want to know; None: the file does not say.
+        skills: tasks that it was made for (names, `tag:TAG`, `all`, and `SUITE:` before them for those of other suites), for selectors that want to
+            know; None: the file does not say.
         mapping: the policy's own names and conventions; those of this package where the file has no such table.
     """
 
@@ -105,11 +106,8 @@ def load_policy_file(file: Path) -> PolicySpec:
         raise table.error("location", f"must be 'local': a policy of kind {kind!r} sees the simulator's state, which nothing sends over a network")
     observation = table.table("observation", {"cameras": [], "image_size": 16} if privileged else ...)
     cameras = observation.strings("cameras")
-    for camera in cameras:
-        if camera not in CAMERAS:
-            raise observation.error("cameras", f"unknown camera {camera!r}, known: {', '.join(CAMERAS)}")
     if not (cameras or privileged) or len(set(cameras)) < len(cameras):
-        raise observation.error("cameras", f"must name one or more different cameras of {', '.join(CAMERAS)}, got {list(cameras)}")
+        raise observation.error("cameras", f"must name one or more different cameras, got {list(cameras)}")
     image_size = observation.integer("image_size", 16, 1024)
     observation.done()
     remote = None
@@ -123,7 +121,10 @@ def load_policy_file(file: Path) -> PolicySpec:
             url=section.get("url", str, None),
         )
         if remote.url is not None and not remote.url.startswith(("ws://", "wss://")):
-            raise section.error("url", f"must start with ws:// or wss://, got {remote.url!r}")
+            told = f", got {remote.url!r}" if re.fullmatch(r"\w+://[\w.-]*", remote.url) else ""  # else there may be a password in it
+            raise section.error("url", f"must start with ws:// or wss://{told}")
+        if remote.url is not None and not re.fullmatch(r"wss?://[^\s\"'<>]+", remote.url):
+            raise section.error("url", "must hold no spaces, quotes, < or > (within a password: %20, %22, %27, %3C, %3E)")
         section.done()
     cost = table.table("price", {})
     price = Price(*(cost.number(key, 0.0, 1e6, 0.0) for key in ("per_action", "per_call", "per_megabyte")))

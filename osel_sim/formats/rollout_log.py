@@ -9,13 +9,14 @@ not the usual Panda. Logs of earlier versions are read as before, with what they
 """
 
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import atomic
 from osel_sim.interface.outcome import Outcome, Seconds
 
 if TYPE_CHECKING:
@@ -120,9 +121,8 @@ def write_rollouts(folder: Path, rows: Iterable[Row], metadata: dict[str, Any]) 
     )
     table = pyarrow.Table.from_pylist([vars(row) for row in rows], schema=annotated)
     file = folder / ROLLOUTS
-    partial = file.with_suffix(".partial")
-    pyarrow.parquet.write_table(table, partial, compression="zstd")
-    os.replace(partial, file)
+    with atomic(file) as partial:
+        pyarrow.parquet.write_table(table, partial, compression="zstd")
     return file
 
 
@@ -143,6 +143,7 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
         )
     try:
         found = pyarrow.parquet.read_schema(file)
+        check_rows(file)
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(f"{file} is not a Parquet file ({error})") from None
     raw = found.metadata or {}

@@ -3,12 +3,14 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from osel_sim.core.shown import shown
+
 
 @dataclass(frozen=True)
 class Seconds:
     """Where an episode's time went, in seconds on the virtual clock (never this machine's speed).
 
-    While a remote call is answered the robot holds still and physics goes on, so `motion` (steps / 20 Hz) already contains that wait.
+    While a remote call is answered the robot holds still and physics goes on, so `motion` (steps / control rate) already contains that wait.
     """
 
     upload: float = 0.0
@@ -24,7 +26,7 @@ class Outcome:
     Attributes:
         success: the goal predicates held at the end.
         subgoals: fraction of the task's subgoals reached, in [0, 1].
-        steps: control steps at 20 Hz, waiting included.
+        steps: control steps, waiting included.
         seconds: upload, inference, download, motion.
         calls: how often the policy was asked for a chunk of actions.
         actions: how many of its actions were executed.
@@ -42,6 +44,12 @@ class Outcome:
     price: float
     fallback: str | None = None
     error: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("fallback", "error"):  # servers and policies have a say in them
+            told = getattr(self, name)
+            if isinstance(told, str):
+                object.__setattr__(self, name, shown(told))
 
     def to_dict(self) -> dict[str, Any]:
         """As plain data, `seconds` a dictionary of its own."""

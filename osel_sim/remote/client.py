@@ -13,12 +13,14 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.core.errors import PolicyError, RemoteError
+from osel_sim.core.shown import shown
 from osel_sim.formats.mapping import Mapping
+from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Actions, Observation
 from osel_sim.policy.local import check_actions
 from osel_sim.policy.mapping import actions_of, message_of
 from osel_sim.remote.codec import ProtocolError, pack, unpack
-from osel_sim.remote.protocol import IMAGES, RESET, Greeting
+from osel_sim.remote.protocol import IMAGES, RESET, Greeting, check_header
 
 MAX_ANSWER = 16 << 20  # bytes; a chunk of 1,000 actions has 56,000
 CLOSE_SECONDS = 1.0
@@ -29,7 +31,7 @@ class Answer:
     """What came back for one observation.
 
     Attributes:
-        actions: (T, 7) float32 in [-1, 1].
+        actions: (T, D) float32 within the environment's bounds.
         measured_seconds: from sending to having it, on this machine.
         bytes_up, bytes_down: length of the two frames; the answer's without its timing entries, which would make a price depend on the machine.
     """
@@ -47,16 +49,30 @@ class RemoteClient:
 
     Args:
         url: `ws://host:port` or `wss://...`.
-        token: sent as `Authorization: Api-Key ...`; None sends none.
+        environment: what the actions are for; they are checked and clipped accordingly.
+        token: sent as `Authorization: Api-Key ...`; none is sent if it is None or empty.
         timeout: real seconds for one answer, and for connecting.
         expect: what a server of ours must say it is; None takes any.
         mapping: names and conventions of a server that is not ours.
+
+    Raises:
+        UsageError: the token is not fit for a header.
     """
 
     def __init__(
-        self, url: str, token: str | None = None, timeout: float = 30.0, expect: Greeting | None = None, mapping: Mapping | None = None
+        self,
+        url: str,
+        environment: EnvironmentSpec,
+        token: str | None = None,
+        timeout: float = 30.0,
+        expect: Greeting | None = None,
+        mapping: Mapping | None = None,
     ) -> None:
-        self.url, self._token, self._timeout, self._expect = url, token, timeout, expect
+        self.url = shown(url)
+        """The address without what is secret in it; errors begin with it."""
+        self._address, self._timeout, self._expect = url, timeout, expect
+        self._token = None if token is None else check_header(token)
+        self._environment = environment
         self._mapping = mapping or Mapping()
         self._connection: ClientConnection | None = None
         self._hang_up = contextlib.ExitStack()
@@ -94,6 +110,10 @@ class RemoteClient:
             self._greeting = Greeting.parse(metadata)
         except ProtocolError as error:
             raise self._fail(str(error)) from None
+        there, here = self._greeting, (self._environment.action.dimension, self._environment.state_size)
+        if there is not None and (there.action_dim, there.state_dim) != here:
+            theirs = f"{there.action_dim} and {there.state_dim} numbers"
+            raise self._fail(f"its actions and states have {theirs}, those of the environment of {self._environment.name} {here[0]} and {here[1]}")
         if self._greeting is not None and self._expect is not None and self._greeting != self._expect:
             raise self._fail(f"serves {self._greeting}, expected {self._expect}")
 
@@ -117,16 +137,18 @@ class RemoteClient:
             RemoteError: timeout, closed, an error message, or an answer without proper actions.
         """
         start = time.perf_counter()
+        environment = self._environment
         if self._connection is None:
             raise RemoteError(f"{self.url}: not connected")
-        reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation)) if self.foreign else observation)
+        reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation), environment) if self.foreign else observation)
         measured = time.perf_counter() - start
         key = self._mapping.actions if self.foreign else "actions"
         if not isinstance(reply, dict) or key not in reply:
             got = ", ".join(sorted(str(name)[:40] for name in list(reply)[:10])) if isinstance(reply, dict) else type(reply).__name__
             raise self._fail(f"answered without {key} (it has: {got or 'nothing'})")
         try:
-            actions = check_actions(actions_of(reply[key], self._mapping) if self.foreign else reply[key])
+            own = actions_of(reply[key], self._mapping, environment.action) if self.foreign else reply[key]
+            actions = check_actions(own, environment.action)
         except PolicyError as error:
             raise self._fail(str(error)) from None
         payload = {key: value for key, value in reply.items() if not (isinstance(key, str) and key.endswith("timing"))}
@@ -142,14 +164,14 @@ class RemoteClient:
         headers = {"Authorization": f"Api-Key {self._token}"} if self._token else None
         try:
             opening = connect(
-                self.url,
+                self._address,
                 additional_headers=headers,
                 compression=None,
                 max_size=MAX_ANSWER,
                 open_timeout=self._timeout,
                 close_timeout=CLOSE_SECONDS,
                 ping_interval=None,  # a server that computes in its event loop (openpi's) answers no pings meanwhile
-                proxy=None if _is_loopback(self.url) else True,
+                proxy=None if _is_loopback(self._address) else True,
             )
             connection = self._hang_up.enter_context(opening)
         except InvalidStatus as error:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from osel_sim.analysis.clusters import complete_instances
+from osel_sim.analysis.clusters import complete_rows
 from osel_sim.analysis.estimate import Estimate
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.outcomes import remote_policies
@@ -103,7 +103,7 @@ def bounds(low: float, high: float) -> str:
 
 
 def _verdict(log: LoggedOutcomes, weights: RewardWeights, routing: Routing | None) -> Verdict:
-    rewards = log.mean_rewards(weights)[complete_instances(log, weights)]
+    rewards = log.mean_rewards(weights)[complete_rows(log, weights)]
     means = rewards.mean(axis=0)
     best, oracle = int(means.argmax()), float(rewards.max(axis=1).mean())
     success = float(np.nanmean(log.success[:, best]))

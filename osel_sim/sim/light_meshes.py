@@ -4,15 +4,16 @@ Decimated once with fast-simplification and kept in the user's cache folder. Mes
 same to the last bit; where a robot shows such a mesh as well, what it shows becomes a mesh of its own.
 """
 
-import hashlib
 import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.arrays import read_arrays
+from osel_sim.core.errors import DataError
+from osel_sim.core.files import atomic, content_digest
 from osel_sim.interface.robot import LightMeshes
 
 ROBOT = ("robot0_", "gripper0_", "fixed_mount0_")
@@ -39,7 +40,7 @@ def lighten(spec: Any, xml: str, how: LightMeshes) -> None:
     import robosuite
 
     made_of = f"{how.keep} {how.fewest} {how.most} {how.join} {mujoco.__version__} {robosuite.__version__} {SHOWN} {xml}"
-    file = cache_folder() / f"light_meshes_{hashlib.sha256(made_of.encode()).hexdigest()[:16]}.npz"
+    file = cache_folder() / f"light_meshes_{content_digest(made_of)[:16]}.npz"
     light = _load(file)
     if light is None:
         light = _make(mujoco.MjModel.from_xml_string(xml), how)
@@ -136,14 +137,12 @@ def _proper(faces: NDArray[Any]) -> NDArray[np.int32]:
 
 def _save(file: Path, light: dict[str, NDArray[Any]]) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as handle:
+    with atomic(file, shared=True) as partial, partial.open("wb") as handle:
         np.savez(handle, **light)  # type: ignore[arg-type]
-    os.replace(handle.name, file)  # atomic: several processes may make it at once, with the same bytes
 
 
 def _load(file: Path) -> dict[str, NDArray[Any]] | None:
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            return dict(archive)
-    except (OSError, ValueError, EOFError):  # missing, or torn by a crash: make it anew
+        return read_arrays(file, "meshes")
+    except DataError:  # missing, or torn by a crash: make it anew
         return None

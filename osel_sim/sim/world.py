@@ -69,7 +69,8 @@ class World:
         """Orientation of the grip site as axis-angle (3,), radians.
 
         A gripper that points down is half a turn away from the identity, where axis-angle jumps between v and -v. Of the two quaternions that mean
-        the same, the one with a positive x is taken, and angles run up to a whole turn, so that the jump is far from where the robot works.
+        the same, the one with a positive x is taken, and angles run up to a whole turn, so that the jump is far from where the robot works;
+        scipy's Rotation stops at half a turn.
         """
         quaternion = np.empty(4)
         self._mujoco.mju_mat2Quat(quaternion, self._control.matrix)

@@ -6,7 +6,6 @@ LeRobotDataset that was not finalised cannot be read.
 
 import functools
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,12 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.formats.run_config import robots_said
+from osel_sim.core.files import read_json, write_text
 from osel_sim.formats.task_file import TaskSpec
-from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM
 from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.sim.specification import ACTION_DIM, CAMERAS, CONTROL_HZ, STATE_DIM
 
-CAMERAS = ("agentview", "wrist")
 BURST_PROBABILITY = 0.04
 """Chance that a burst of noise starts at a step."""
 BURST_STEPS = (4, 10)
@@ -45,6 +43,9 @@ class Shard:
     levels: tuple[int, ...]
     axes: Mapping[str, int] = field(default_factory=dict)
     robot: str = DEFAULT_ROBOT
+
+    def __str__(self) -> str:
+        return self.folder.name
 
 
 def features(task: TaskSpec, image_size: int) -> dict[str, dict[str, Any]]:
@@ -72,7 +73,7 @@ def side_file(task: TaskSpec, levels: tuple[int, ...], axes: Mapping[str, int], 
     return {
         "task": task.name,
         "task_version": task.version,
-        **robots_said([task]),
+        **({} if task.robot == DEFAULT_ROBOT else {"robot": task.robot}),
         "levels": list(levels),
         "axes": dict(axes),
         "split": "train",
@@ -94,7 +95,7 @@ def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
     """
     done = shard.folder / "done.json"
     if done.is_file():
-        report = json.loads(done.read_text())
+        report = read_json(done)
         return report["frames"], report["episodes"], report["failed"]
     shutil.rmtree(shard.folder, ignore_errors=True)
 
@@ -119,9 +120,7 @@ def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
         dataset.save_episode()
         frames, episodes = frames + len(rows), episodes + 1
     dataset.finalize()
-    temporary = shard.folder / "done.json.part"
-    temporary.write_text(json.dumps({"frames": frames, "episodes": episodes, "failed": failed}))
-    os.replace(temporary, done)
+    write_text(done, json.dumps({"frames": frames, "episodes": episodes, "failed": failed}))
     return frames, episodes, failed
 
 
