@@ -16,13 +16,12 @@ from run_helpers import HORIZON, children, command, environment, execute, make_w
 
 from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
-from osel_sim.core import content
 from osel_sim.core.files import digest
 from osel_sim.episodes.workers import Plan
 from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
-from osel_sim.formats.task_file import load_task_file
 from osel_sim.record import main as record_main
+from osel_sim.suites.registry import find_task
 
 INSTANCES, REPEATS = 5, 2
 SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)
@@ -56,7 +55,7 @@ def resume(world: Path, folder: Path, *flags: object) -> subprocess.CompletedPro
 
 
 def test_repeats_are_of_all_levels():
-    task, policy = load_task_file(content.find("tasks", "lift")), library.load_policy("local_small")
+    task, policy = find_task("lift"), library.load_policy("local_small")
     plan = Plan((task,), (policy,), (policy,), range(40), (0, 2), "test", "osel_small", repeats=3, repeat_every=10)
     repeated = [plan.instances[key] for key in plan.instances if len(plan.episodes(key)) == 3]
     assert sorted(instance.level for instance in repeated) == [0, 0, 2, 2]

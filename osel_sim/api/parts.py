@@ -56,8 +56,9 @@ def load_policy(name: str, *, policies_dir: Path | str | None = None) -> "Policy
     """
     from osel_sim.formats import library
     from osel_sim.policy.registry import make_policy
+    from osel_sim.sim.specification import specification
 
-    return make_policy(library.load_policy(name, None if policies_dir is None else Path(policies_dir)))
+    return make_policy(library.load_policy(name, None if policies_dir is None else Path(policies_dir)), specification())
 
 
 def make_selector(name: str, policies: Sequence[str], context_dim: int, seed: int = 0, **settings: Any) -> "Selector":

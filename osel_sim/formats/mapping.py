@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 from osel_sim.formats.validate import Table
 
 STATE_PARTS = {"position": 3, "axis_angle": 3, "quaternion": 4, "euler": 3, "fingers": 2, "gripper": 1}
-"""What a state can be put together from, and how many numbers each has: gripper position (metres, world); its orientation as axis-angle, quaternion
-(x, y, z, w) or roll-pitch-yaw (radians); both finger positions (metres), or how far the gripper is open (0 to 1)."""
-OUR_STATE = ("position", "axis_angle", "fingers")
+"""What the state of one of our robots can be put together from, and how many numbers each has: gripper position (metres, world); its orientation as
+axis-angle, quaternion (x, y, z, w) or roll-pitch-yaw (radians); both finger positions (metres), or how far the gripper is open (0 to 1)."""
 GRIPPERS = ("closed_positive", "open_positive", "closed_one", "open_one")
 """What the gripper's number means: 1 closed and -1 open (as robosuite and LIBERO have it), 1 open and -1 closed, 1 closed and 0 open, 1 open and 0
 closed."""
-ACTION_SIZE = 7
 ENVIRONMENT_STATES = ("hashed_text",)
 
 
@@ -23,12 +21,13 @@ class Mapping:
     Attributes:
         images: camera here -> key there.
         blank: keys of further images that the policy wants and nothing here shows: they are black.
-        state: key of the state; empty: it gets none. state_parts: what it is put together from, in order.
+        state: key of the state; empty: it gets none. state_parts: what it is put together from, in
+            order; empty: the environment's own parts.
         prompt: key of the instruction.
-        actions: key of the answer's actions (openpi only). columns: which of an action's numbers are the six motions and the
-            gripper; empty: it has just those seven.
+        actions: key of the answer's actions (openpi only). columns: which of an action's numbers are the motions and the
+            gripper; empty: it has just those.
         gripper: what the gripper's number means.
-        scale: what the six motions are multiplied by: 20 for metres and 2 for radians a step, as 1 is 5 cm and 0.5 rad here.
+        scale: what the motions are multiplied by: 20 for metres and 2 for radians a step, as 1 is 5 cm and 0.5 rad here.
         environment_state: what `observation.environment_state` is filled with: `hashed_text`, or empty where the policy has none.
         normalised: false if the checkpoint is known to come without the statistics it was trained with.
     """
@@ -36,7 +35,7 @@ class Mapping:
     images: AnyMapping[str, str] = field(default_factory=dict)
     blank: tuple[str, ...] = ()
     state: str = "observation.state"
-    state_parts: tuple[str, ...] = OUR_STATE
+    state_parts: tuple[str, ...] = ()
     prompt: str = "task"
     actions: str = "actions"
     columns: tuple[int, ...] = ()
@@ -44,11 +43,6 @@ class Mapping:
     scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
     environment_state: str = ""
     normalised: bool = True
-
-    @property
-    def state_size(self) -> int:
-        """How many numbers the state has."""
-        return sum(STATE_PARTS[part] for part in self.state_parts)
 
     def key(self, camera: str) -> str:
         """What the policy calls a camera's image."""
@@ -68,11 +62,9 @@ def read_mapping(table: Table, cameras: tuple[str, ...]) -> Mapping:
         names.one_of(camera, camera, cameras)
         images[camera] = names.get(camera, str)
     parts = table.strings("state_parts", list(plain.state_parts))
-    for part in parts:
-        table.one_of("state_parts", part, list(STATE_PARTS))
     columns = table.get("columns", list, list(plain.columns))
-    if ("columns" in table.data and len(columns) != ACTION_SIZE) or not all(type(column) is int and 0 <= column < 1000 for column in columns):
-        raise table.error("columns", f"must be {ACTION_SIZE} column numbers of an action, counted from 0, got {columns!r}")
+    if ("columns" in table.data and not columns) or not all(type(column) is int and 0 <= column < 1000 for column in columns):
+        raise table.error("columns", f"must be column numbers of an action, counted from 0, got {columns!r}")
     result = Mapping(
         images=images,
         blank=table.strings("blank", []),
@@ -82,7 +74,7 @@ def read_mapping(table: Table, cameras: tuple[str, ...]) -> Mapping:
         actions=table.get("actions", str, plain.actions),
         columns=tuple(columns),
         gripper=table.choice("gripper", GRIPPERS, plain.gripper),
-        scale=table.numbers("scale", len(plain.scale)) if "scale" in table.data else plain.scale,
+        scale=table.numbers("scale", len(table.get("scale", list))) if "scale" in table.data else plain.scale,
         environment_state=table.choice("environment_state", ENVIRONMENT_STATES) if "environment_state" in table.data else "",
         normalised=table.get("normalised", bool, True),
     )
