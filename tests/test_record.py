@@ -288,7 +288,7 @@ def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_r
     again = resume(world, world / "dying")
     assert again.returncode == 0 and "lost" not in again.stderr, again.stderr
     assert read_rollouts(world / "dying")[0] == [row for row in whole if row.repeat == 0]
-    assert "is complete" in resume(world, world / "dying").stdout
+    assert "is complete" in resume(world, world / "dying").stderr
 
 
 def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, reference):
@@ -299,7 +299,7 @@ def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, r
     write_rollouts(folder, rows, {key: value for key, value in metadata.items() if key != "schema_version"})
     before = files(folder)
     done = resume(world, folder)
-    assert done.returncode == 0 and "is complete" in done.stdout and files(folder) == before
+    assert done.returncode == 0 and "is complete" in done.stderr and files(folder) == before
 
 
 def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
