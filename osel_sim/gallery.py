@@ -1,16 +1,16 @@
 """A contact sheet of every task at every level: `python -m osel_sim.gallery --out sheet.png`."""
 
-import argparse
 import contextlib
-import os
 import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from osel_sim import cli
-from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.api.settings import CONTENT, MAIN, Count, Folder, Index, Names, Settings, settings
+from osel_sim.cli.command import Command
+from osel_sim.core.errors import SettingError, UnknownNameError
+from osel_sim.core.files import write_bytes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,83 +30,86 @@ EXAMPLES = """examples:
 """
 
 
-@cli.main
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
-    options = parser().parse_args(arguments)
+@settings
+class GalleryConfig(Settings):
+    """Draw a contact sheet: a row a task (or an axis), a column a level, the instruction underneath."""
+
+    out: Annotated[Path | None, MAIN] = None
+    """the .png to write"""
+    task: Annotated[Names | None, MAIN] = None
+    """which tasks: names, tag:TAG, or all; of other suites SUITE:NAME (default: all)"""
+    each_axis: Annotated[bool, MAIN] = False
+    """of one task: a row for each axis alone"""
+    seed: Annotated[Index, MAIN] = 0
+    """of the instances"""
+    size: Annotated[Count, MAIN] = 256
+    """pixels of a picture, square"""
+    camera: Annotated[str | None, MAIN] = None
+    """which camera, such as wrist (default: the one that encoders are shown)"""
+    robot: Annotated[str | None, MAIN] = None
+    """robot that stands there, such as UR5e (default: the one each task file names, else Panda)"""
+    tasks: Annotated[Folder | None, CONTENT] = None
+    """folder with task files of your own"""
+
+
+def _execute(config: GalleryConfig) -> int:
     from osel_sim.suites.registry import ALL, select_tasks
 
-    tasks = select_tasks(options.task or [ALL], options.tasks)
-    if options.out.suffix.lower() != ".png":
-        raise UsageError(f"--out {options.out} must end in .png")
-    if options.each_axis and len(tasks) != 1:
-        raise UsageError(f"--each-axis shows one task: give --task with one of {', '.join(task.name for task in tasks)}")
-    picture = _sheet(options, tasks)
+    if config.out is None or config.out.suffix.lower() != ".png":
+        raise SettingError("out", "is missing: give the .png to write" if config.out is None else f"{config.out} must end in .png")
+    tasks = select_tasks(config.task or (ALL,), config.tasks, config.robot)
+    if config.each_axis and len(tasks) != 1:
+        raise SettingError("each_axis", f"shows one task: give --task with one of {', '.join(task.name for task in tasks)}")
+    picture = _sheet(config, tasks)
 
     import cv2
 
-    partial = options.out.with_name(f".{options.out.name}.partial")
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    partial.write_bytes(cv2.imencode(".png", picture[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())
-    os.replace(partial, options.out)
-    print(f"{options.out}: {picture.shape[1]} x {picture.shape[0]} pixels")
+    config.out.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(config.out, cv2.imencode(".png", picture[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())
+    print(f"{config.out}: {picture.shape[1]} x {picture.shape[0]} pixels")
     return 0
 
 
-def parser() -> cli.Parser:
-    """Flags of the command."""
-    result = cli.Parser("gallery", "Draw a contact sheet: a row a task (or an axis), a column a level, the instruction underneath.", EXAMPLES)
-    add = result.add_argument
-    add("--task", nargs="+", metavar="NAME", help="which tasks: names, tag:TAG, or all; of other suites SUITE:NAME (default: all)")
-    add("--each-axis", action="store_true", help="of one task: a row for each axis alone")
-    add("--seed", type=cli.non_negative_int, default=0, help="of the instances (default: %(default)s)")
-    add("--size", type=cli.positive_int, default=256, help="pixels of a picture, square (default: %(default)s)")
-    add("--camera", metavar="NAME", help="agentview or wrist; other suites have others (default: the one that encoders are shown)")
-    add("--out", type=Path, required=True, metavar="FILE", help="the .png to write")
-    add("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
-    return result
-
-
-def _sheet(options: argparse.Namespace, tasks: "Sequence[Task]") -> "NDArray[np.uint8]":
+def _sheet(config: GalleryConfig, tasks: "Sequence[Task]") -> "NDArray[np.uint8]":
     import numpy as np
 
     levels = sorted({level for task in tasks for level in task.suite.spec.levels})
     rows: list[NDArray[np.uint8]] = []
     for task in tasks:
-        if options.camera not in (None, *task.specification.cameras):
-            raise UnknownNameError("camera", options.camera, task.specification.cameras, f"--camera; task {task.name}")
+        if config.camera not in (None, *task.specification.cameras):
+            raise UnknownNameError("camera", config.camera or "", task.specification.cameras, f"--camera; task {task.name}")
         own = [level if level in task.suite.spec.levels else None for level in levels]
         with contextlib.closing(task.open()) as env:
-            if options.each_axis:
+            if config.each_axis:
                 axes = [axis for axis in task.suite.spec.axes if axis in task.info.axes]
-                rows += [_row(options, task, env, axis, [None if level is None else {axis: level} for level in own]) for axis in axes]
+                rows += [_row(config, task, env, axis, [None if level is None else {axis: level} for level in own]) for axis in axes]
             else:
-                rows.append(_row(options, task, env, task.name, own))
+                rows.append(_row(config, task, env, task.name, own))
     if not rows:
-        raise UsageError(f"--each-axis: task {tasks[0].name} has no axes")
+        raise SettingError("each_axis", f"task {tasks[0].name} has no axes")
     header = np.full((HEADER, rows[0].shape[1], 3), PAPER, np.uint8)
     for column, level in enumerate(levels):
-        _write(header, f"level {level}", (MARGIN + column * options.size + 6, 18), INK, 0.5)
+        _write(header, f"level {level}", (MARGIN + column * config.size + 6, 18), INK, 0.5)
     return np.concatenate([header, *rows])
 
 
 def _row(
-    options: argparse.Namespace, task: "Task", env: "Environment", name: str, settings: "Sequence[int | Mapping[str, int] | None]"
+    config: GalleryConfig, task: "Task", env: "Environment", name: str, settings: "Sequence[int | Mapping[str, int] | None]"
 ) -> "NDArray[np.uint8]":
     """One row: the same seed, more and more perturbed: by a level, or by axes at levels of their own; None leaves a gap."""
     import numpy as np
 
-    size: int = options.size
+    size = config.size
     row = np.full((size + BAND, MARGIN + len(settings) * size, 3), PAPER, np.uint8)
     for number, line in enumerate(textwrap.wrap(name.replace("_", " "), 14)):
         _write(row, line, (8, 24 + 20 * number), INK, 0.5)
     for column, setting in enumerate(settings):
         if setting is None:
             continue
-        instance = task.instance(options.seed, setting) if isinstance(setting, int) else task.instance(options.seed, axes=setting)
+        instance = task.instance(config.seed, setting) if isinstance(setting, int) else task.instance(config.seed, axes=setting)
         env.load(instance)
         left = MARGIN + column * size
-        row[:size, left : left + size] = env.image(options.camera or env.specification.context_camera, size, size, "full")
+        row[:size, left : left + size] = env.image(config.camera or env.specification.context_camera, size, size, "full")
         for number, line in enumerate(textwrap.wrap(instance.instruction, size // 7)[:3]):
             _write(row, line, (left + 4, size + 15 + 15 * number), GREY, 0.36)
     return row
@@ -118,5 +121,7 @@ def _write(image: "NDArray[np.uint8]", text: str, at: tuple[int, int], colour: t
     cv2.putText(image, text.encode("ascii", "replace").decode(), at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
 
 
+main = Command("gallery", GalleryConfig, _execute, EXAMPLES)
+
 if __name__ == "__main__":
-    sys.exit(main(None))
+    sys.exit(main())

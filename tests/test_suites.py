@@ -25,7 +25,7 @@ from osel_sim.interface.call import Call
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.suite import Task
 from osel_sim.policy.environment_fit import misfits
-from osel_sim.policy.registry import load_policy
+from osel_sim.policy.registry import session_factory
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.sim.specification import specification
@@ -76,45 +76,53 @@ def test_unknown_names_get_the_nearest(name, message):
         select_tasks([name])
 
 
-def write_suite(folder: Path, module: str) -> None:
-    """A package `broken` with one suite of that name."""
-    info = folder / "broken-1.0.dist-info"
+def write_suite(folder: Path, module: str) -> str:
+    """A package with one suite, whose name is given."""
+    name = f"broken_{folder.name}"
+    info = folder / f"{name}-1.0.dist-info"
     info.mkdir()
-    (folder / "broken_suite.py").write_text(module)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[osel_sim.suites]\nbroken = broken_suite:Broken\n")
+    (folder / f"{name}.py").write_text(module.replace("NAME", name))
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[osel_sim.suites]\n{name} = {name}:Broken\n")
+    return name
 
 
 def test_a_missing_package_is_named_with_the_command_that_gets_it(tmp_path, monkeypatch):
-    write_suite(
+    name = write_suite(
         tmp_path,
         "from osel_sim.interface.suite import SuiteSpec, TaskInfo\n"
         "class Broken:\n"
-        "    spec = SuiteSpec('broken', 'Needs what is not there', install='pip install broken[simulator]')\n"
+        "    spec = SuiteSpec('NAME', 'Needs what is not there', install='pip install broken[simulator]')\n"
         "    tasks = {'one': TaskInfo('One', 10, '1')}\n"
         "    def open(self, task):\n"
         "        import no_such_simulator.core\n",
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    needs = r"suite 'broken' needs the package 'no_such_simulator', which is not installed: pip install broken\[simulator\]"
+    needs = rf"suite '{name}' needs the package 'no_such_simulator', which is not installed: pip install broken\[simulator\]"
     with pytest.raises(MissingPackageError, match=needs):
-        find_task("broken:one").open()
+        find_task(f"{name}:one").open()
 
 
 @pytest.mark.parametrize(
     ("module", "error", "message"),
     [
         ("import no_such_simulator\n", MissingPackageError, "needs the package 'no_such_simulator'.*pip install no_such_simulator"),
-        ("Broken = 3\n", UsageError, "'broken': broken_suite:Broken does not make a suite"),
+        ("Broken = 3\n", UsageError, ":Broken makes no suite"),
         ("from toy_suite import Toy as Broken\n", UsageError, "makes one that calls itself 'toy'"),
     ],
 )
 def test_a_suite_that_cannot_be_loaded_says_why(module, error, message, tmp_path, monkeypatch):
-    write_suite(tmp_path, module)
+    name = write_suite(tmp_path, module)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "broken_suite", raising=False)
     with pytest.raises(error, match=message):
-        find_task("broken:one")
+        find_task(f"{name}:one")
+
+
+def test_other_suites_have_their_own_robot():
+    assert find_task("lift", robot="UR5e").robot == "UR5e" and find_task("lift").specification.robot == "Panda"
+    assert find_task("lift", robot="UR5e").instance(0).key == "lift/test/0/0-UR5e"
+    with pytest.raises(UsageError, match="suite 'toy' has its own robot: leave --robot out"):
+        find_task("toy:reach", robot="UR5e")
 
 
 def test_what_a_suite_does_not_have_is_refused_by_name():
@@ -239,7 +247,7 @@ def test_an_entry_point_that_takes_no_environment_is_told_so(tmp_path, monkeypat
     monkeypatch.syspath_prepend(str(tmp_path))
     spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), kind="old")
     with pytest.raises(UsageError, match=r"kind 'old': its entry point must be a function load\(spec, environment\)"):
-        load_policy(spec, find_task("toy:reach").specification)
+        session_factory(spec, find_task("toy:reach").specification)
 
 
 def test_quaternions_are_computed_of_an_axis_angle_and_not_known_without():

@@ -1,6 +1,7 @@
 """Policies made ready to drive: local ones loaded, servers of remote ones started, fallbacks found."""
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Self
@@ -12,14 +13,20 @@ from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.policy.environment_fit import check_environment, misfits
+from osel_sim.policy.objects import PolicyObject
+
+logger = logging.getLogger(__name__)
 
 
-def choose_policies(names: Sequence[str] | None, environment: EnvironmentSpec, folder: Path | None = None) -> list[PolicySpec]:
-    """Policy files by name, or all that fit the environment and see no more than a robot could (`left_out` tells the others).
+def choose_policies(
+    names: Sequence[str] | None, environment: EnvironmentSpec, folder: Path | None = None, objects: Mapping[str, PolicyObject] | None = None
+) -> list[PolicySpec]:
+    """Policy files by name, or all that fit the environment and see no more than a robot could; the log says which are left out.
 
     Args:
         environment: what they are to drive.
         folder: the user's own policy files.
+        objects: policies that no file describes, by name.
 
     Raises:
         UnknownNameError: no such policy.
@@ -30,6 +37,8 @@ def choose_policies(names: Sequence[str] | None, environment: EnvironmentSpec, f
         unfit = left_out(environment, folder)
         specs = [library.load_policy(name, folder) for name in content.files("policies", folder) if name not in unfit]
         names = [spec.name for spec in specs if not spec.is_privileged]
+        if unfit:
+            logger.info("not made for the environment of %s, and left out: %s (naming one says why)", environment.name, ", ".join(unfit))
         if not names and unfit:
             raise UsageError(f"no policy there is drives in the environment of {environment.name}, such as {next(iter(unfit.values()))}")
     wanted = list(names)
@@ -38,7 +47,8 @@ def choose_policies(names: Sequence[str] | None, environment: EnvironmentSpec, f
     for name in wanted:
         if wanted.count(name) > 1:
             raise UsageError(f"policy {name!r} is named twice after --policies")
-    found = [library.load_policy(name, folder) for name in wanted]
+    at_hand = objects or {}
+    found = [at_hand[name].spec_for(environment) if name in at_hand else library.load_policy(name, folder) for name in wanted]
     for spec in found:
         check_environment(spec, environment)
     return found
@@ -86,6 +96,7 @@ class Drivers:
     Args:
         specs: the policies and their fallbacks (`with_fallbacks`).
         environment: what they are to drive.
+        objects: those of them that no file describes, by name.
 
     Raises:
         ContentError: a policy's file does not fit the environment.
@@ -93,7 +104,7 @@ class Drivers:
         RemoteError: a server cannot be started or reached.
     """
 
-    def __init__(self, specs: Sequence[PolicySpec], environment: EnvironmentSpec) -> None:
+    def __init__(self, specs: Sequence[PolicySpec], environment: EnvironmentSpec, objects: Mapping[str, PolicyObject] | None = None) -> None:
         from osel_sim.policy.expert import ExpertCaller
         from osel_sim.policy.local import LocalCaller
         from osel_sim.policy.registry import make_policy
@@ -110,7 +121,9 @@ class Drivers:
             try:
                 for spec in specs:
                     if not spec.is_remote:
-                        caller = ExpertCaller(spec) if spec.is_privileged else LocalCaller(make_policy(spec, environment), spec, environment)
+                        at_hand = (objects or {}).get(spec.name)
+                        policy = None if spec.is_privileged else at_hand.policy if at_hand else make_policy(spec, environment)
+                        caller = ExpertCaller(spec) if policy is None else LocalCaller(policy, spec, environment)
                         self._drivers[spec.name] = Driver(spec, caller)
             except OselError as error:
                 problem = error

@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -155,7 +155,7 @@ class LiveRun:
         for subscriber in self.subscribers:
             subscriber.on_decision(decision, rewards)
         # The journal comes last: what it does not have did not happen.
-        self._journal.append(asdict(decision))
+        self._journal.append(decision.to_dict())
         self.decisions.append(decision)
         self._remember(rewards)
         self._learn(context, choice, decision.reward)
@@ -225,5 +225,6 @@ class LiveRun:
             reward=self._reward(outcome),
             fallback=outcome.fallback,
             error=outcome.error,
+            robot=instance.other_robot,
             **own,
         )

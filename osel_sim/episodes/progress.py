@@ -1,8 +1,10 @@
 """The progress bar of a live run."""
 
+import contextlib
 from collections.abc import Mapping
-from typing import Any, override
+from typing import override
 
+from osel_sim.core.progress import Bar, progress
 from osel_sim.episodes.run_subscribers import Run, RunSubscriber
 from osel_sim.formats.journal import Decision
 
@@ -16,22 +18,22 @@ class Progress(RunSubscriber):
 
     def __init__(self, decisions: int) -> None:
         self._total = decisions
-        self._bar: Any = None
+        self._shown = contextlib.ExitStack()
+        self._bar: Bar | None = None
         self._policies: list[str] = []
         self._seen: list[Decision] = []
 
     @override
     def on_start(self, run: Run) -> None:
-        from tqdm import tqdm  # type: ignore[import-untyped]
-
         self._policies, self._seen = list(run.policies), list(run.decisions)
-        self._bar = tqdm(total=self._total, initial=len(self._seen), unit="episode", dynamic_ncols=True)
+        self._bar = self._shown.enter_context(progress(self._total, "episode", initial=len(self._seen)))
 
     @override
     def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:
         self._seen.append(decision)
-        self._bar.set_postfix_str(self._words(), refresh=False)
-        self._bar.update()
+        if self._bar is not None:
+            self._bar.note(self._words())
+            self._bar.update()
 
     @override
     def on_end(self, run: Run) -> None:
@@ -39,8 +41,7 @@ class Progress(RunSubscriber):
 
     @override
     def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
+        self._shown.close()
 
     def _words(self) -> str:
         rewards = [decision.reward for decision in self._seen if decision.reward is not None]

@@ -1,12 +1,14 @@
 """Videos: what the camera saw, with instruction, policy, step and price written into the frame."""
 
 import textwrap
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.files import atomic
 from osel_sim.episodes.loop import Frame, Subscriber
 from osel_sim.interface.outcome import Outcome
 
@@ -31,7 +33,7 @@ class Video(Subscriber):
 
     def __init__(self, file: Path, camera: str | None = None, quality: str = "full") -> None:
         self.file, self.camera, self.quality = file, camera, quality
-        self._partial = file.with_name(f".{file.name}.partial")
+        self._file = ExitStack()
         self._writer: Generator[None, NDArray[np.uint8] | None, None] | None = None
         self._last: Frame | None = None
         self._every, self._fps = 1, float(RATE)
@@ -47,7 +49,7 @@ class Video(Subscriber):
         self._fps = specification.control_hz / self._every
         self.file.parent.mkdir(parents=True, exist_ok=True)
         self._writer = imageio_ffmpeg.write_frames(
-            str(self._partial),
+            str(self._file.enter_context(atomic(self.file))),
             (SIZE, SIZE + _BAND),
             fps=self._fps,
             codec="libx264",
@@ -74,7 +76,7 @@ class Video(Subscriber):
         for _ in range(int(HOLD_SECONDS * self._fps) - 1):
             self._send(self._image)
         self._writer.close()
-        self._partial.replace(self.file)
+        self._file.close()
 
     def _show(self, frame: Frame, outcome: Outcome | None = None) -> None:
         self._last = frame

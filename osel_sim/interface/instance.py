@@ -61,6 +61,11 @@ class Instance(Protocol):
         """What the instruction names second: where the first goes; empty where it names nothing else."""
         ...
 
+    @property
+    def other_robot(self) -> str | None:
+        """Name of the robot, where it is another than the suite's usual one; None: the usual one."""
+        ...
+
 
 def label(level: int, axes: str | None) -> str:
     """`2`, `camera=2,light=1` or `1,camera=3`: the part of an instance's key that says how it is perturbed."""
@@ -80,6 +85,7 @@ class SeededInstance:
     phrasing: str = ""
     target: str = ""
     container: str = ""
+    other_robot: str | None = None
 
     @property
     def key(self) -> str:

@@ -1,5 +1,6 @@
 """Applies a policy file's `[mapping]`: our observations in a policy's words, its actions in ours."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -52,7 +53,7 @@ def _part(parts: dict[str, NDArray[np.float64]], part: str) -> NDArray[np.float6
     source = parts[DERIVED[part]]
     if part == "gripper":
         return np.clip((source[:1] - source[1:2]) / (2 * OPEN_FINGER), 0.0, 1.0)
-    return quaternion(source) if part == "quaternion" else euler(source)
+    return orientation(source, part)
 
 
 def message_of(observation: Observation, mapping: Mapping, cameras: tuple[str, ...], environment: EnvironmentSpec) -> dict[str, Any]:
@@ -103,18 +104,18 @@ def has_scale(mapping: Mapping) -> bool:
     return any(scale != 1.0 for scale in mapping.scale)
 
 
-def quaternion(axis_angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axis-angle (3,) -> quaternion (x, y, z, w) with w >= 0."""
-    angle = float(np.linalg.norm(axis_angle))
-    axis = axis_angle / angle if angle > 0 else np.zeros(3)
-    result = np.concatenate([axis * np.sin(angle / 2), [np.cos(angle / 2)]])
-    return -result if result[3] < 0 else result
+def orientation(axis_angle: NDArray[np.float64], form: str) -> NDArray[np.float64]:
+    """Axis-angle (3,) in another form.
 
+    Args:
+        form: `quaternion` (x, y, z, w) with w >= 0, or `euler`: roll, pitch and yaw in radians, turned about the fixed x, then y, then z axis; at a
+            pitch of 90 degrees, where roll and yaw mean the same turn, yaw is 0.
+    """
+    from scipy.spatial.transform import Rotation
 
-def euler(axis_angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axis-angle (3,) -> roll, pitch and yaw (3,) in radians, turned about the fixed x, then y, then z axis."""
-    x, y, z, w = quaternion(axis_angle)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.array([roll, pitch, yaw])
+    rotation = Rotation.from_rotvec(axis_angle)
+    if form == "quaternion":
+        return np.asarray(rotation.as_quat(canonical=True), np.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # at that pitch
+        return np.asarray(rotation.as_euler("xyz"), np.float64)
