@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import osel_sim
 from osel_sim.core.errors import ContentError, MissingPackageError, UnknownNameError, UsageError
 from osel_sim.episodes.drivers import Drivers, choose_policies, left_out
 from osel_sim.episodes.live import LiveOptions, LiveRun
@@ -449,6 +450,24 @@ def test_subscribers_are_told_of_a_run_and_one_that_fails_leaves_it_whole(tmp_pa
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
     decisions = read_journal(tmp_path / "whole" / "episodes.jsonl")
     assert {decision.task for decision in decisions} <= {"toy:reach", "toy:hurry"}
+
+
+@pytest.mark.slow
+def test_from_python_a_run_of_another_suite_is_watched_and_driven_by_an_object_at_hand(tmp_path):
+    class East:
+        def reset(self, instruction):
+            self.seen = set()
+
+        def act(self, observation):
+            self.seen |= observation.keys()
+            return np.ones((30, 2), np.float32)
+
+    east, told = East(), Told()
+    names = [east, "scripted_expert"]
+    result = osel_sim.run(task="toy:reach", policies=names, selector="fixed:east", episodes=2, out=tmp_path / "run", subscribers=[told])
+    assert east.seen == {"observation.images.top", "observation.state", "task"}
+    assert [decision.policy for decision in result.journal] == ["east"] * 2 and result.page is not None and result.page.is_file()
+    assert [event for event in told.heard if event[0] == "decision"] == [("decision", 0, 1), ("decision", 1, 1)]
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------

@@ -96,6 +96,7 @@ def run(
     *,
     policies: "Sequence[str | Policy | PolicyObject] | None" = None,
     selector: "SelectorLike | None" = None,
+    subscribers: "Sequence[RunSubscriber]" = (),
     **values: Any,
 ) -> RunResult:
     """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward.
@@ -104,6 +105,7 @@ def run(
         config: settings as one object; `values` change some of them.
         policies: names of policy files, or objects with `reset` and `act` (`osel_sim.as_policy` says what they are shown and cost).
         selector: name of a selector, or a class or function of one's own: called with the policies' names, the context's length and the seed.
+        subscribers: what else watches the run (`osel_sim.episodes.run_subscribers`), beside progress, timings, TensorBoard and the page.
         values: settings by name, as `RunConfig` has them.
 
     Raises:
@@ -120,7 +122,7 @@ def run(
         factory = None if isinstance(selector, str) else selector
     config = RunConfig.of(**values) if config is None else config.changed(**values)
     with trusting(config.trust):
-        return _Run(config, objects, factory).execute()
+        return _Run(config, objects, factory, subscribers).execute()
 
 
 def _name(factory: Any) -> str:
@@ -133,16 +135,23 @@ class _Run:
     Args:
         objects: policies that no file describes.
         factory: makes the selector where it is none of the registry's.
+        watchers: subscribers of the caller's own.
     """
 
-    def __init__(self, config: RunConfig, objects: "Mapping[str, PolicyObject]", factory: "Callable[..., Selector] | None") -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        objects: "Mapping[str, PolicyObject]",
+        factory: "Callable[..., Selector] | None",
+        watchers: "Sequence[RunSubscriber]",
+    ) -> None:
         from osel_sim.api.reward import weights_of
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
         from osel_sim.reporting.live_page import LivePage
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
-        self.config, self.objects, self.factory = config, objects, factory
+        self.config, self.objects, self.factory, self.watchers = config, objects, factory, watchers
         if config.tensorboard:
             from osel_sim.episodes.tensorboard import check_installed
 
@@ -270,7 +279,7 @@ class _Run:
         config = self.config
         films = [Films(folder, config.filmed)] if config.video else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard)) if asked]
-        return [TimingFile(), *films, *wanted, Progress(config.episodes), self.page]
+        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), self.page]
 
     def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
