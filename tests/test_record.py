@@ -288,7 +288,7 @@ def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_r
     again = resume(world, world / "dying")
     assert again.returncode == 0 and "lost" not in again.stderr, again.stderr
     assert read_rollouts(world / "dying")[0] == [row for row in whole if row.repeat == 0]
-    assert "is complete" in resume(world, world / "dying").stdout
+    assert "is complete" in resume(world, world / "dying").stderr
 
 
 def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, reference):
@@ -299,7 +299,7 @@ def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, r
     write_rollouts(folder, rows, {key: value for key, value in metadata.items() if key != "schema_version"})
     before = files(folder)
     done = resume(world, folder)
-    assert done.returncode == 0 and "is complete" in done.stdout and files(folder) == before
+    assert done.returncode == 0 and "is complete" in done.stderr and files(folder) == before
 
 
 def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
@@ -317,6 +317,20 @@ def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
         for place, log in ((reference[0], clean), (folder, rows))
     )
     assert (before != after).any(axis=1).all()
+
+
+@pytest.mark.slow
+def test_another_robot_is_recorded_and_stays_that_of_the_recording(world, reference, capsys):
+    folder = world / "ur5e"
+    assert execute(world, "record", "--instances", 1, "--robot", "UR5e", "--workers", 1, "--out", folder).returncode == 0
+    rows, metadata = read_rollouts(folder)
+    assert {(row.instance, row.robot) for row in rows} == {("short/test/0/0-UR5e", "UR5e")}
+    assert (metadata["robot"], metadata["schema_version"]) == ("UR5e", 3)
+    assert read_rollouts(reference[0])[1]["schema_version"] == 2
+    before = files(folder)
+    assert resume(world, folder).returncode == 0 and files(folder) == before
+    assert record_main(["--resume", "--out", str(folder), "--robot", "Panda"]) == 2
+    assert "--robot Panda: " in (text := capsys.readouterr().err) and "began with UR5e" in text
 
 
 def test_summary_of_a_log(reference, capsys):
@@ -346,6 +360,7 @@ def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
         (["--level", "17"], "unknown level 17"),
         (["--axis", "camra=2"], "did you mean 'camera'?"),
         (["--axis", "camera"], "must read AXIS=LEVEL"),
+        (["--robot", "UR5"], "did you mean 'UR5e'?"),
         (["--resume"], "there is no run in"),
     ],
 )

@@ -68,11 +68,11 @@ class RemoteClient:
         expect: Greeting | None = None,
         mapping: Mapping | None = None,
     ) -> None:
+        self._environment = environment
         self.url = shown(url)
         """The address without what is secret in it; errors begin with it."""
         self._address, self._timeout, self._expect = url, timeout, expect
         self._token = None if token is None else check_header(token)
-        self._environment = environment
         self._mapping = mapping or Mapping()
         self._connection: ClientConnection | None = None
         self._hang_up = contextlib.ExitStack()
