@@ -52,8 +52,8 @@ def blocks(language: str) -> list[Block]:
 
 
 def smaller(code: str) -> str:
-    """The code with fewer episodes and seeds."""
-    return re.sub(r"\bseeds=\d+", "seeds=1", re.sub(r"\bepisodes=\d+", "episodes=2", code))
+    """The code with fewer episodes, seeds and decisions."""
+    return re.sub(r"\bseeds=\d+", "seeds=1, decisions=40", re.sub(r"\bepisodes=\d+", "episodes=2", code))
 
 
 def checkout(folder: Path) -> Path:
