@@ -1,4 +1,4 @@
-"""Typed errors. Every one of them is the user's to read: commands print its message as one line and exit with `exit_code`."""
+"""Typed errors. Every one of them is the user's to read: commands print its message and exit with `exit_code`."""
 
 import difflib
 from collections.abc import Iterable
@@ -19,17 +19,20 @@ class UnknownNameError(UsageError):
 
     def __init__(self, what: str, name: str, known: Iterable[str], where: str = "") -> None:
         known = sorted(known)
-        near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-        hint = f"did you mean {near[0]!r}? " if near else ""
         listing = f"known: {', '.join(known) or 'none'}" + (f" ({where})" if where else "")
-        super().__init__(f"unknown {what} {name!r}: {hint}{listing}")
+        super().__init__(f"unknown {what} {name!r}: {did_you_mean(name, known)}{listing}")
 
 
 class ContentError(OselError):
-    """A task or policy file is wrong. The message names the file, the key and what would be right."""
+    """A task, policy or other TOML file is wrong. The message has a line for each fault: the file, the key and what would be right.
 
-    def __init__(self, file: object, key: str, problem: str) -> None:
-        super().__init__(f"{file}: {key}: {problem}")
+    Attributes:
+        faults: (key, problem) of each.
+    """
+
+    def __init__(self, file: object, key: str, problem: str, *more: tuple[str, str]) -> None:
+        self.faults = ((key, problem), *more)
+        super().__init__("\n".join(f"{file}: {key}: {problem}" for key, problem in self.faults))
 
 
 class CheckpointError(OselError):
@@ -50,3 +53,9 @@ class RemoteError(OselError):
 
 class DataError(OselError):
     """A journal, rollout log or dataset cannot be read or does not have the promised form."""
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """`did you mean 'x'? `, or nothing where nothing is near."""
+    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"did you mean {near[0]!r}? " if near else ""

@@ -20,7 +20,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 
 from osel_sim import content, doctor
 from osel_sim.errors import CheckpointError, ContentError, PolicyError, RemoteError, UsageError
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.mapping import actions_of, euler, message_of, quaternion, state_of
@@ -43,10 +43,10 @@ def observation(**changes: Any) -> dict[str, Any]:
 def test_a_state_is_put_together_from_its_parts() -> None:
     parts = ("position", "quaternion", "gripper")
     half = np.sqrt(0.5)
-    assert state_of(observation(), Mapping(state_parts=parts)) == pytest.approx([0.1, 0.2, 1.0, half, 0, 0, half, 1.0])
-    assert state_of(observation(), Mapping(state_parts=("euler",))) == pytest.approx([np.pi / 2, 0, 0])
-    assert np.array_equal(state_of(observation(), Mapping()), STATE)
-    assert Mapping(state_parts=parts).state_size == 8
+    assert state_of(observation(), Conventions(state_parts=parts)) == pytest.approx([0.1, 0.2, 1.0, half, 0, 0, half, 1.0])
+    assert state_of(observation(), Conventions(state_parts=("euler",))) == pytest.approx([np.pi / 2, 0, 0])
+    assert np.array_equal(state_of(observation(), Conventions()), STATE)
+    assert Conventions(state_parts=parts).state_size == 8
 
 
 def test_rotations_agree_with_another_implementation() -> None:
@@ -65,17 +65,17 @@ def test_every_gripper_convention_ends_in_ours(gripper: str, opened: float, clos
     chunk = np.zeros((2, 7))
     chunk[:, 6] = opened, closed
     chunk[:, 0] = 0.01
-    actions = actions_of(chunk, Mapping(gripper=gripper, scale=(20.0, 20.0, 20.0, 2.0, 2.0, 2.0)))
+    actions = actions_of(chunk, Conventions(gripper=gripper, scale=(20.0, 20.0, 20.0, 2.0, 2.0, 2.0)))
     assert actions[:, 6].tolist() == [-1, 1] and actions[:, 0] == pytest.approx(0.2)
 
 
 def test_columns_are_picked_and_a_wrong_width_is_explained() -> None:
     wide = np.arange(32.0)[None].repeat(3, axis=0)
-    assert actions_of(wide, Mapping(columns=(0, 1, 2, 3, 4, 5, 7)))[0].tolist() == [0, 1, 2, 3, 4, 5, 7]
+    assert actions_of(wide, Conventions(columns=(0, 1, 2, 3, 4, 5, 7)))[0].tolist() == [0, 1, 2, 3, 4, 5, 7]
     with pytest.raises(PolicyError, match=r"shape \(3, 32\), the robot takes \(T, 7\).*columns"):
-        actions_of(wide, Mapping())
+        actions_of(wide, Conventions())
     with pytest.raises(PolicyError, match=r"columns = .* needs more"):
-        actions_of(np.zeros(6), Mapping(columns=(0, 1, 2, 3, 4, 5, 6)))
+        actions_of(np.zeros(6), Conventions(columns=(0, 1, 2, 3, 4, 5, 6)))
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ def save_act(folder: Path, state: int = 8, action: int = 7, statistics: bool = T
 def spec_of(folder: Path, **mapping: Any) -> Any:
     given = {"images": {"agentview": "observation.images.image", "wrist": "observation.images.image2"}} | mapping
     local = content.load_policy("local_small")
-    return dataclasses.replace(local, cameras=("agentview", "wrist"), image_size=SIZE, checkpoint=str(folder), mapping=Mapping(**given))
+    return dataclasses.replace(local, cameras=("agentview", "wrist"), image_size=SIZE, checkpoint=str(folder), mapping=Conventions(**given))
 
 
 @pytest.fixture(scope="module")

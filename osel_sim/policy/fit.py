@@ -10,7 +10,7 @@ from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from osel_sim.errors import CheckpointError
-from osel_sim.formats.mapping import ENVIRONMENT_STATES, STATE_PARTS, Mapping
+from osel_sim.formats.conventions import ENVIRONMENT_STATES, STATE_PARTS, Conventions
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.policy.base import ACTION_DIM
 
@@ -69,7 +69,7 @@ def check_processors(spec: PolicySpec, checkpoint: str) -> None:
         )
 
 
-def camera_keys(mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, str]:
+def camera_keys(mapping: Conventions, cameras: tuple[str, ...]) -> dict[str, str]:
     """Checkpoint's image key -> camera here."""
     return {mapping.key(camera): camera for camera in cameras}
 

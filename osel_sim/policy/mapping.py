@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.errors import PolicyError
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
 from osel_sim.policy.base import ACTION_DIM, Observation
 
 STATE = "observation.state"
@@ -14,7 +14,7 @@ OPEN_FINGER = 0.04
 """Where a finger of the fully open gripper is, metres."""
 
 
-def state_of(observation: Observation, mapping: Mapping) -> NDArray[np.float32]:
+def state_of(observation: Observation, mapping: Conventions) -> NDArray[np.float32]:
     """The state as the policy wants it, (state_size,)."""
     state = np.asarray(observation[STATE], np.float64)
     return np.concatenate([_part(state, part) for part in mapping.state_parts]).astype(np.float32)
@@ -29,7 +29,7 @@ def _part(state: NDArray[np.float64], part: str) -> NDArray[np.float64]:
     return {"position": state[:3], "axis_angle": state[3:6], "fingers": state[6:8]}[part]
 
 
-def message_of(observation: Observation, mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, Any]:
+def message_of(observation: Observation, mapping: Conventions, cameras: tuple[str, ...]) -> dict[str, Any]:
     """An observation under the policy's own names."""
     message: dict[str, Any] = {mapping.key(camera): observation[f"observation.images.{camera}"] for camera in cameras}
     if cameras:
@@ -41,7 +41,7 @@ def message_of(observation: Observation, mapping: Mapping, cameras: tuple[str, .
     return message
 
 
-def actions_of(value: Any, mapping: Mapping) -> NDArray[Any]:
+def actions_of(value: Any, mapping: Conventions) -> NDArray[Any]:
     """A policy's chunk (T, N), or single action (N,), as OSC_POSE actions (T, 7).
 
     Raises:

@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.errors import PolicyError, RemoteError
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
 from osel_sim.policy.base import Actions, Observation
 from osel_sim.policy.call import check_actions
 from osel_sim.policy.mapping import actions_of, message_of
@@ -54,10 +54,10 @@ class RemoteClient:
     """
 
     def __init__(
-        self, url: str, token: str | None = None, timeout: float = 30.0, expect: Greeting | None = None, mapping: Mapping | None = None
+        self, url: str, token: str | None = None, timeout: float = 30.0, expect: Greeting | None = None, mapping: Conventions | None = None
     ) -> None:
         self.url, self._token, self._timeout, self._expect = url, token, timeout, expect
-        self._mapping = mapping or Mapping()
+        self._mapping = mapping or Conventions()
         self._connection: ClientConnection | None = None
         self._hang_up = contextlib.ExitStack()
         self._greeting: Greeting | None = None

@@ -1,0 +1,64 @@
+"""Reads TOML files into pydantic models. One error tells all that is wrong with a file: where, and what would be right."""
+
+import codecs
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from osel_sim.errors import ContentError
+from osel_sim.formats.toml_faults import faults_of
+
+
+
+def load_toml[T](model: type[T], file: Path, context: Mapping[str, Any] | None = None) -> T:
+    """Read and check a file; arguments and errors are those of `check`."""
+    return check(model, read_toml(file), file, context)
+
+
+def read_toml(file: Path) -> dict[str, Any]:
+    """A TOML file as plain data. A byte order mark, which some editors write, is passed over.
+
+    Raises:
+        ContentError: it cannot be read, is not UTF-8 or not TOML; with the line.
+    """
+    try:
+        data = file.read_bytes().removeprefix(codecs.BOM_UTF8)
+    except OSError as error:
+        raise ContentError(file, "file", f"cannot be read ({error.strerror})") from None
+    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise ContentError(file, "TOML", "is UTF-16 text; save it as UTF-8")
+    try:
+        return tomllib.loads(data.decode())
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ContentError(file, "TOML", f"is not UTF-8 text (at line {line}); save it as UTF-8") from None
+    except ValueError as error:  # a TOMLDecodeError, or an integer too long for Python
+        raise ContentError(file, "TOML", str(error)) from None
+    except RecursionError:
+        raise ContentError(file, "TOML", "has lists or tables within each other too deep to be read") from None
+
+
+def check[T](
+    model: type[T], data: dict[str, Any], file: Path | str, context: Mapping[str, Any] | None = None, called: Callable[[str], str] = str
+) -> T:
+    """Check plain data.
+
+    Args:
+        model: a pydantic dataclass with the configuration `toml_types.TABLE`.
+        file: what error messages begin with. Validators find it in their context, with the data as they are (`data`).
+        context: what else validators want to know.
+        called: what error messages call a key, such as `scene.region.object.x`.
+
+    Raises:
+        ContentError: naming the file and, for each fault, the key and what would be right.
+    """
+    adapter = TypeAdapter(model)
+    try:
+        return adapter.validate_python(data, context={"file": file, "data": data, **(context or {})})
+    except ValidationError as error:
+        found = faults_of(error, adapter.json_schema(), data)
+    first, *more = [(called(key), problem) for key, problem in found]
+    raise ContentError(file, *first, *more)
