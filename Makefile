@@ -30,6 +30,7 @@ lint: $(READY)
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+	.venv/bin/lint-imports
 
 bench: $(READY)
 	$(PYTHON) benchmarks/simulation.py $(ARGS)

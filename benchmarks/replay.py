@@ -20,9 +20,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from stable_baselines3 import PPO
 
-from osel_sim.offline.engine import _one_thread, replay_one
+from osel_sim.analysis.engine import _one_thread, replay_one
 from osel_sim.selection.environment import SelectionEnv, table_rounds
-from osel_sim.selection.ppo import PPOSelector
+from osel_sim.selection.ppo.sb3 import PPOSelector
 
 POLICIES = ("local", "remote")
 
@@ -85,10 +85,10 @@ def sb3(contexts, rewards, seed: int) -> PPO:
 
 def in_processes(options: argparse.Namespace) -> float:
     """Seconds that the replays of a log take."""
+    from osel_sim.analysis.engine import Setup, replay
+    from osel_sim.analysis.log import read_log
     from osel_sim.context.cache import ContextCache
     from osel_sim.formats.rollout_log import Row, write_rollouts
-    from osel_sim.offline.engine import Setup, replay
-    from osel_sim.offline.log import read_log
     from osel_sim.selection.reward import RewardWeights
 
     contexts, rewards = stream(options.decisions, options.dim)

@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from osel_sim import content
-from osel_sim.episode import Driver, Frame, Subscriber, run_episode
-from osel_sim.policy.call import LocalCaller
+from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
+from osel_sim.formats import library
+from osel_sim.policy.local import LocalCaller
 from osel_sim.policy.registry import make_policy
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.instance import make_instance
@@ -40,7 +40,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("docs/episode.png"))
     options = parser.parse_args()
-    spec = dataclasses.replace(content.load_policy(options.policy), remote=None)  # driven here, without a network
+    spec = dataclasses.replace(library.load_policy(options.policy), remote=None)  # driven here, without a network
     env, camera = TaskEnv("pick_place"), Camera()
     instance = make_instance(env.task, options.seed)
     env.load(instance)

@@ -31,7 +31,7 @@ import os
 
 import numpy as np
 
-from osel_sim.policy.base import Actions, Observation
+from osel_sim.interface.policy import Actions, Observation
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.protocol import Greeting, example_observation
 from osel_sim.remote.server import PolicyServer

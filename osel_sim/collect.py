@@ -10,9 +10,10 @@ from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
-from osel_sim import cli, content
-from osel_sim.children import end_with_parent
-from osel_sim.errors import UsageError
+from osel_sim import cli
+from osel_sim.core.errors import UsageError
+from osel_sim.core.processes import end_with_parent
+from osel_sim.formats import library
 from osel_sim.formats.levels import parse_axes, resolve
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.training.annotations import SIDE_FILE, read_json
@@ -44,7 +45,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--tasks", type=cli.folder, default=None, help="folder with task files of your own")
     options = parser.parse_args(arguments)
 
-    tasks = content.select_tasks(options.task, options.tasks)
+    tasks = library.select_tasks(options.task, options.tasks)
     axes = parse_axes(options.axis)
     outs = [options.out] if len(tasks) == 1 else [options.out / task.name for task in tasks]
     for task, out in zip(tasks, outs, strict=True):
@@ -88,8 +89,8 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     """Record all missing shards with `workers` processes, then join them into one dataset at `out`."""
     from tqdm import tqdm  # type: ignore[import-untyped]
 
-    from osel_sim.demonstrations import Shard, record_shard, side_file
     from osel_sim.sim.gl import choose_backend
+    from osel_sim.training.demonstrations import Shard, record_shard, side_file
 
     choose_backend()
     _quiet_lerobot()

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from osel_sim import cli, content
-from osel_sim.errors import ContentError, DisplayError
+from osel_sim import cli
+from osel_sim.core import content
+from osel_sim.core.errors import ContentError, DisplayError
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
 
@@ -74,7 +75,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _examine_policy(options: argparse.Namespace) -> int:
-    from osel_sim.runtime.policy_check import check_policy, find_policy, print_report
+    from osel_sim.cli.policy_report import print_report
+    from osel_sim.episodes.policy_check import check_policy, find_policy
 
     spec, folder = find_policy(options.policy, options.policies_dir)
     out = options.out or Path("runs") / "doctor" / spec.name
@@ -266,7 +268,7 @@ def _print(checks: list[Check], ready: bool) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from osel_sim.runtime.tables import console
+    from osel_sim.cli.console import console
 
     colours = {OK: "green", NOTE: "yellow", MISSING: "red"}
     table = Table("", "area", "what", "found", "to put it right")

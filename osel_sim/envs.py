@@ -6,7 +6,7 @@ env = gymnasium.make("osel_sim.envs:osel_sim/pick_place-v0", cameras=("agentview
 
 import gymnasium
 
-from osel_sim import content
+from osel_sim.core import content
 
 
 def register_envs() -> None:

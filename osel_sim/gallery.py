@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from osel_sim import cli, content
-from osel_sim.errors import UsageError
+from osel_sim import cli
+from osel_sim.core import content
+from osel_sim.core.errors import UsageError
 from osel_sim.formats.levels import AXES, LEVELS
 
 if TYPE_CHECKING:

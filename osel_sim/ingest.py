@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from osel_sim import cli
-from osel_sim.errors import UsageError
-from osel_sim.ingestion.mapping import VALUES
+from osel_sim.core.errors import UsageError
+from osel_sim.ingestion.columns import VALUES
 
 if TYPE_CHECKING:
     from osel_sim.formats.rollout_log import Row
-    from osel_sim.ingestion.mapping import Mapping
+    from osel_sim.ingestion.columns import Columns
 
 METRICS = ("table", "action-mse")
 PRESETS = ("mmlu", "waymo", "alfred", "oxe")  # the weights themselves: osel_sim.selection.reward
@@ -41,7 +41,7 @@ EXAMPLES = """examples:
   python -m osel_sim.ingest --metric action-mse --dataset data/bridge data/fractal --policies local_small remote_large --out logs/oxe
 
 Writes rollouts.parquet and contexts.npz into --out, nothing if the table is wrong. The same command goes on with an interrupted encoding, and another
---encoder adds its contexts to the log. How a mapping file looks: the top of osel_sim/ingestion/mapping.py."""
+--encoder adds its contexts to the log. How a mapping file looks: the top of osel_sim/ingestion/columns.py."""
 
 
 @cli.main
@@ -126,14 +126,14 @@ def _table(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
     from osel_sim.ingestion.convert import convert
-    from osel_sim.ingestion.tables import read_tables
+    from osel_sim.ingestion.readers import read_tables
     from osel_sim.ingestion.write import Instance, check_out, file_digest, load_image, write_log
 
     _refuse(options, ("frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
     start = time.perf_counter()
-    mapping = _mapping(options)
-    records = read_tables(mapping)
-    converted = convert(mapping, records)
+    columns = _columns(options)
+    records = read_tables(columns)
+    converted = convert(columns, records)
     instances = []
     for source in converted.sources:
         for image in source.images:
@@ -150,16 +150,16 @@ def _table(options: argparse.Namespace) -> int:
     print(f"{len(records)} rows: {len(instances)} instances, {len(converted.policies)} policies, {len(converted.rows)} outcomes")
     if converted.dropped:
         print(f"{converted.dropped} duplicate rows left out, {converted.differing or 'none'} of which differed from the row that was kept")
-    name = options.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if mapping.images else TFIDF)
+    name = options.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if columns.images else TFIDF)
     files = sorted({record.file for record in records})
     metadata = {
-        "task": mapping.name,
+        "task": columns.name,
         "policies": converted.policies,
         "source": {"metric": "table", "files": {file.name: file_digest(file) for file in files}},
     }
     texts = [item.text for item in instances]
     identity = write_log(
-        options.out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(mapping.images), options.device), metadata
+        options.out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(columns.images), options.device), metadata
     )
     return _finish(options.out, converted.rows, "table", options.preset or "mmlu", identity, start)
 
@@ -167,9 +167,9 @@ def _table(options: argparse.Namespace) -> int:
 def _action_mse(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF, load_log_encoder
+    from osel_sim.episodes.drivers import choose_policies
     from osel_sim.ingestion.action_mse import Settings, measure, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
-    from osel_sim.runtime.drivers import choose_policies
 
     start = time.perf_counter()
     if not options.dataset:
@@ -194,25 +194,26 @@ def _action_mse(options: argparse.Namespace) -> int:
     return _finish(options.out, rows, "action-mse", options.preset or "oxe", identity, start)
 
 
-def _mapping(options: argparse.Namespace) -> "Mapping":
-    from osel_sim.ingestion.flags import as_table
-    from osel_sim.ingestion.mapping_file import load_mapping, parse_mapping
+def _columns(options: argparse.Namespace) -> "Columns":
+    from osel_sim.ingestion.columns import COMMAND_LINE
+    from osel_sim.ingestion.columns_file import load_columns, parse_columns
+    from osel_sim.ingestion.flags import as_data
 
     files = tuple(options.files or ())
     if options.map is not None:
         _refuse(options, (*TABLE_FLAGS, "policies", "at_least"), "--map: write it into the file")
-        return load_mapping(options.map, files)
+        return load_columns(options.map, files)
     if not files:
         raise UsageError("--map or --files is missing: give a mapping file, or tables and what their columns mean")
     for flag in ("text", "success"):
         if getattr(options, flag) is None:
             raise UsageError(f"--{flag} is missing; python -m osel_sim.ingest --help shows examples")
-    return parse_mapping(as_table(options, files), Path())
+    return parse_columns(as_data(options, files), COMMAND_LINE, Path())
 
 
 def _finish(folder: Path, rows: "list[Row]", metric: str, preset_name: str, encoder: str, start: float) -> int:
-    from osel_sim.runtime.rollout_tables import print_rollouts
-    from osel_sim.runtime.tables import console
+    from osel_sim.cli.console import console
+    from osel_sim.cli.rollout_tables import print_rollouts
     from osel_sim.selection.reward import preset
 
     print(f"{folder}: {len(rows)} rows, contexts of {encoder}, {time.perf_counter() - start:.0f} s")

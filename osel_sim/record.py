@@ -7,13 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim import cli, content
-from osel_sim.errors import DataError, OselError, UsageError
-from osel_sim.reward_flags import DEFAULT_PRESET
+from osel_sim import cli
+from osel_sim.cli.reward_flags import DEFAULT_PRESET
+from osel_sim.core import content
+from osel_sim.core.errors import DataError, OselError, UsageError
+from osel_sim.formats import library
 from osel_sim.run import NOISE_HELP, SPLITS
 
 if TYPE_CHECKING:
-    from osel_sim.runtime.recording import Recording
+    from osel_sim.episodes.recording import Recording
 
 EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine
@@ -69,20 +71,21 @@ def parser() -> cli.Parser:
 
 def _record(options: argparse.Namespace) -> int:
     from osel_sim.context.encoder import DEFAULT_ENCODER, load_encoder
+    from osel_sim.core.files import read_json, write_json
+    from osel_sim.episodes.declared_skills import declare
+    from osel_sim.episodes.drivers import choose_policies, with_fallbacks
+    from osel_sim.episodes.recording import Recording
+    from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, read_json, start_or_resume, write_json
-    from osel_sim.runtime.drivers import choose_policies, with_fallbacks
-    from osel_sim.runtime.recording import Recording
-    from osel_sim.runtime.workers import Plan
+    from osel_sim.formats.run_config import RUN, check_folder, content_digests, environment, start_or_resume
     from osel_sim.sim.gl import choose_backend
-    from osel_sim.skills import declare
 
     added_encoder = options.encoder is not None  # one given is added; the encoder that was there must not have changed
     if options.resume and not options.task and options.out is not None:
         check_folder(options.out, {}, resume=True)
         _take_settings(options, read_json(options.out / RUN).get("configuration", {}))
     options.repeats, options.repeat_every = options.repeats or 1, options.repeat_every or 1
-    tasks = content.select_tasks(options.task, options.tasks)
+    tasks = library.select_tasks(options.task, options.tasks)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
     if options.out is None:
@@ -189,7 +192,7 @@ def _record_missing(recording: "Recording", workers: int) -> None:
     """Record what is not there yet, with a progress bar, and add it."""
     from tqdm import tqdm  # type: ignore[import-untyped]
 
-    from osel_sim.runtime.workers import record
+    from osel_sim.episodes.workers import record
 
     plan, missing = recording.plan, recording.missing()
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
@@ -214,9 +217,9 @@ def _record_missing(recording: "Recording", workers: int) -> None:
 
 
 def _print_summary(folder: Path) -> None:
+    from osel_sim.cli.console import console
+    from osel_sim.cli.rollout_tables import print_rollouts
     from osel_sim.formats.rollout_log import read_rollouts
-    from osel_sim.runtime.rollout_tables import print_rollouts
-    from osel_sim.runtime.tables import console
     from osel_sim.selection.reward import preset
 
     rows, _ = read_rollouts(folder)

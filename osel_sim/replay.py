@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from osel_sim import cli
-from osel_sim.errors import DataError, UnknownNameError, UsageError
-from osel_sim.reward_flags import add_reward_flags, weights_of
+from osel_sim.cli.reward_flags import add_reward_flags, weights_of
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
-    from osel_sim.offline.engine import Setup
-    from osel_sim.offline.live import LiveLog
-    from osel_sim.offline.log import LoggedOutcomes
+    from osel_sim.analysis.engine import Setup
+    from osel_sim.analysis.live import LiveLog
+    from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.selection.reward import RewardWeights
 
 COSTS, SKILLS = "expected_costs", "skills"
@@ -42,9 +42,9 @@ what each fixed policy, random choice and a linear model would have earned (off_
 def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
     options = parser().parse_args(arguments)
+    from osel_sim.analysis.live import is_live_run, read_live
+    from osel_sim.analysis.log import read_log
     from osel_sim.formats.replay_result import check_folder
-    from osel_sim.offline.live import is_live_run, read_live
-    from osel_sim.offline.log import read_log
 
     selectors = choose_selectors(options.selectors, halved=options.half is not None)
     folder: Path = options.out or Path("runs") / f"replay-{options.log.resolve().name}"
@@ -97,15 +97,15 @@ def _replay(
     """Replay, write and print."""
     from tqdm import tqdm  # type: ignore[import-untyped]
 
+    from osel_sim.analysis.engine import replay
+    from osel_sim.analysis.frontier import selector_frontiers
+    from osel_sim.analysis.oracles import oracles
+    from osel_sim.analysis.result import build, tables, with_fixed
+    from osel_sim.analysis.streams import complete_instances
+    from osel_sim.cli.console import console
+    from osel_sim.cli.replay_tables import print_replay
     from osel_sim.formats.replay_result import write_replay
     from osel_sim.formats.rollout_log import DECLARED
-    from osel_sim.offline.engine import replay
-    from osel_sim.offline.frontier import selector_frontiers
-    from osel_sim.offline.oracles import oracles
-    from osel_sim.offline.result import build, tables, with_fixed
-    from osel_sim.offline.streams import complete_instances
-    from osel_sim.offline.tables import print_replay
-    from osel_sim.runtime.tables import console
     from osel_sim.selection.skills import Skills
 
     if options.policies:
@@ -161,9 +161,9 @@ def _replay(
 
 def _off_policy(options: argparse.Namespace, live: "LiveLog", weights: "RewardWeights") -> dict[str, Any]:
     """Estimates from a live run's propensities, printed."""
-    from osel_sim.offline.evaluation import evaluate
-    from osel_sim.offline.tables import print_off_policy
-    from osel_sim.runtime.tables import console
+    from osel_sim.analysis.evaluation import evaluate
+    from osel_sim.cli.console import console
+    from osel_sim.cli.replay_tables import print_off_policy
 
     if options.policies or options.half:
         raise UsageError("--policies and --half are for rollout logs: a live run is evaluated as it was made")
@@ -188,8 +188,8 @@ def _setups(
         log: what is replayed.
         others: what costs are known from, and what selectors named `NAME:warm` are shown: the other half, where it is a half that is replayed.
     """
-    from osel_sim.offline.beforehand import Beforehand
-    from osel_sim.offline.engine import Setup
+    from osel_sim.analysis.engine import Setup
+    from osel_sim.analysis.warm_start import Beforehand
     from osel_sim.selection.registry import wanted_of
 
     def setup(weights: "RewardWeights") -> Setup:
@@ -212,9 +212,9 @@ def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[
         UnknownNameError: no such selector.
         UsageError: it needs a package that is not installed, or cannot start warm.
     """
-    from osel_sim.offline.beforehand import check_can_start_warm
-    from osel_sim.offline.engine import WARM
-    from osel_sim.offline.result import REFERENCES
+    from osel_sim.analysis.engine import WARM
+    from osel_sim.analysis.result import REFERENCES
+    from osel_sim.analysis.warm_start import check_can_start_warm
     from osel_sim.selection.registry import selector_locations
     from osel_sim.selection.vowpal import available
 

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from osel_sim import cli
-from osel_sim.errors import DataError, UsageError
-from osel_sim.reward_flags import FLAGS, add_reward_flags, weights_of
+from osel_sim.cli.reward_flags import FLAGS, add_reward_flags, weights_of
+from osel_sim.core.errors import DataError, UsageError
 
 if TYPE_CHECKING:
-    from osel_sim.offline.log import LoggedOutcomes
+    from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.reporting.page import Page
 
 EXAMPLES = """examples:
@@ -52,9 +52,9 @@ def parser() -> cli.Parser:
 
 
 def _page(options: argparse.Namespace) -> "Page":
+    from osel_sim.analysis.live import JOURNAL
     from osel_sim.formats.replay_result import REPLAY
     from osel_sim.formats.rollout_log import ROLLOUTS
-    from osel_sim.offline.live import JOURNAL
 
     folder: Path = options.folder
 
@@ -64,7 +64,7 @@ def _page(options: argparse.Namespace) -> "Page":
         return render_scenes(log, options.scenes, options.tasks) if options.scenes else {}
 
     if (folder / ROLLOUTS).is_file():
-        from osel_sim.offline.log import read_log
+        from osel_sim.analysis.log import read_log
         from osel_sim.reporting.log_page import log_page
 
         log = read_log(folder, options.encoder)

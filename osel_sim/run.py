@@ -8,17 +8,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim import cli, content
-from osel_sim.errors import OselError, UnknownNameError
-from osel_sim.reward_flags import add_reward_flags, weights_of
+from osel_sim import cli
+from osel_sim.cli.reward_flags import add_reward_flags, weights_of
+from osel_sim.core import content
+from osel_sim.core.errors import OselError, UnknownNameError
+from osel_sim.formats import library
 
 if TYPE_CHECKING:
-    from osel_sim.context.encoder import Encoder
+    from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.episodes.live import LiveRun
+    from osel_sim.episodes.tensorboard import TensorBoard
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.formats.task_file import TaskSpec
-    from osel_sim.offline.log import LoggedOutcomes
-    from osel_sim.runtime.live import LiveRun
-    from osel_sim.runtime.tensorboard import TensorBoard
+    from osel_sim.interface.encoder import Encoder
     from osel_sim.selection.reward import RewardWeights
 
 SPLITS = ("train", "validation", "test")
@@ -42,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command; the exit code."""
     options = parser().parse_args(arguments)
     if options.list or options.json:
-        from osel_sim.listing import print_listing
+        from osel_sim.cli.listing import print_listing
 
         print_listing(options.json, options.tasks, options.policies_dir)
         return 0
@@ -81,15 +83,15 @@ def parser() -> cli.Parser:
 
 
 def _run(options: argparse.Namespace) -> int:
+    from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.formats.levels import parse_axes, resolve, split_off
     from osel_sim.formats.run_config import check_folder, environment, start_or_resume
-    from osel_sim.runtime.drivers import choose_policies, with_fallbacks
 
     if options.tensorboard:
-        from osel_sim.runtime.tensorboard import check_installed
+        from osel_sim.episodes.tensorboard import check_installed
 
         check_installed()
-    tasks = content.select_tasks(options.task, options.tasks)
+    tasks = library.select_tasks(options.task, options.tasks)
     policies = choose_policies(options.policies, options.policies_dir)
     everyone = with_fallbacks(policies, options.policies_dir)
     weights = weights_of(options)[0]
@@ -116,8 +118,8 @@ def _run(options: argparse.Namespace) -> int:
     import torch
 
     from osel_sim.context.cache import ContextCache
-    from osel_sim.runtime.drivers import Drivers
-    from osel_sim.runtime.live import LiveOptions, LiveRun
+    from osel_sim.episodes.drivers import Drivers
+    from osel_sim.episodes.live import LiveOptions, LiveRun
     from osel_sim.selection.registry import make_selector
     from osel_sim.sim.task_envs import TaskEnvs
 
@@ -144,7 +146,7 @@ def _run(options: argparse.Namespace) -> int:
         live.replay()
         board = None
         if options.tensorboard:
-            from osel_sim.runtime.tensorboard import TensorBoard
+            from osel_sim.episodes.tensorboard import TensorBoard
 
             board = stack.enter_context(TensorBoard(folder))
             board.update(live)
@@ -190,12 +192,12 @@ def _progress(live: "LiveRun") -> str:
 
 def _report(live: "LiveRun", selector: str) -> None:
     """Write summary, curve, page and the selector's state, and print the table."""
+    from osel_sim.cli.console import console, run_table
+    from osel_sim.core.files import write_json
     from osel_sim.figures import learning_curve
-    from osel_sim.formats.run_config import write_json
     from osel_sim.formats.summary import summarise
     from osel_sim.reporting.page import write_page
     from osel_sim.reporting.run_page import run_page
-    from osel_sim.runtime.tables import console, run_table
     from osel_sim.selection.state import save_state
 
     if not live.decisions:
@@ -250,9 +252,9 @@ def _declared(
     Args:
         extra: folder with the user's own task files.
     """
-    from osel_sim.costs import expected_costs
+    from osel_sim.episodes.declared_skills import declare
+    from osel_sim.episodes.expected_costs import expected_costs
     from osel_sim.selection.registry import setting_names
-    from osel_sim.skills import declare
 
     wanted, known = setting_names(selector), dict[str, Any]()
     if "expected_costs" in wanted:
@@ -266,14 +268,14 @@ def _declared(
 
 def _log(folder: Path, encoder: str, policies: "list[PolicySpec]") -> "LoggedOutcomes":
     """The rollout log of a warm start."""
-    from osel_sim.offline.log import read_log
+    from osel_sim.analysis.log import read_log
 
     return read_log(folder, encoder).only([spec.name for spec in policies])
 
 
 def _start_warm(live: "LiveRun", log: "LoggedOutcomes", episodes: int, seed: int) -> None:
     """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
-    from osel_sim.offline.beforehand import Beforehand, show
+    from osel_sim.analysis.warm_start import Beforehand, show
 
     own = live.instance_keys(episodes)
     log = log.take([row for row, key in enumerate(log.keys) if key not in own])
@@ -291,7 +293,7 @@ def _check_selector(name: str, policies: list[str], warm: bool) -> None:
     if kind == "fixed" and policy not in policies:
         raise UnknownNameError("policy", policy, policies, "give --selector fixed:POLICY")
     if warm:
-        from osel_sim.offline.beforehand import check_can_start_warm
+        from osel_sim.analysis.warm_start import check_can_start_warm
 
         check_can_start_warm(kind)
 
@@ -319,8 +321,9 @@ def _configuration(
     """Everything the journal depends on but the encoder, content of files included. `above`: axes at levels of their own."""
     from dataclasses import asdict
 
+    from osel_sim.core.files import digest
     from osel_sim.formats.rollout_log import ROLLOUTS
-    from osel_sim.formats.run_config import content_digests, digest
+    from osel_sim.formats.run_config import content_digests
 
     warm = {"warm_start": digest(options.warm_start / ROLLOUTS)} if options.warm_start else {}
     return {

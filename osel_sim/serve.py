@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from osel_sim.errors import OselError, UsageError
+from osel_sim.core.errors import OselError, UsageError
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
 if TYPE_CHECKING:
@@ -63,11 +63,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _serve(options: argparse.Namespace) -> int:
-    from osel_sim import content
+    from osel_sim.formats import library
 
     if not 0 <= options.port <= 65535:
         raise UsageError(f"--port must lie in [0, 65535], got {options.port}")
-    spec = content.load_policy(options.policy, options.policies_dir)
+    spec = library.load_policy(options.policy, options.policies_dir)
     given = os.environ.get(options.token_env)
 
     from osel_sim.policy.registry import load_policy

@@ -6,8 +6,9 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from osel_sim import cli, content
-from osel_sim.errors import UsageError
+from osel_sim import cli
+from osel_sim.core.errors import UsageError
+from osel_sim.formats import library
 
 EXAMPLES = """examples:
   python -m osel_sim.train --policy local_small --data data/pick_place --out runs/train/local_small
@@ -63,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if any(argument.partition("=")[0] == "--encoder" for argument in arguments):
-        from osel_sim.context import train as encoder_training
+        from osel_sim.training.encoder import train as encoder_training
 
         return encoder_training.main(arguments)
     return _train_policy(parser().parse_args(arguments))
@@ -90,7 +91,7 @@ def _train_policy(options: argparse.Namespace) -> int:
     for folder in options.data:
         if not folder.is_dir():
             raise UsageError(f"{folder} is not a folder of demonstrations; python -m osel_sim.collect writes one")
-    spec = content.load_policy(options.policy, options.policies_dir)
+    spec = library.load_policy(options.policy, options.policies_dir)
     recipe = load_recipe(options.recipe or find_recipe(options.policy))
     changes = {key: getattr(options, key) for key in ("steps", "batch_size") if getattr(options, key) is not None}
     recipe = replace(recipe, optimisation=replace(recipe.optimisation, **changes), episodes=options.episodes or recipe.episodes)

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from synthetic_log import make_row, write_log
 
+from osel_sim.analysis.log import LoggedOutcomes, read_log
+from osel_sim.analysis.oracles import oracles
+from osel_sim.analysis.result import build, tables, with_fixed
+from osel_sim.analysis.streams import complete_instances
 from osel_sim.context.cache import ContextCache
 from osel_sim.formats.journal import Decision, Lines
-from osel_sim.formats.outcome import Seconds
 from osel_sim.formats.replay_result import Choices, write_replay
-from osel_sim.offline.log import LoggedOutcomes, read_log
-from osel_sim.offline.oracles import oracles
-from osel_sim.offline.result import build, tables, with_fixed
-from osel_sim.offline.streams import complete_instances
+from osel_sim.interface.outcome import Seconds
 from osel_sim.selection.reward import RewardWeights, reward
 
 EVIL = "</script><script>window.pwned = 1</script><img src=x onerror='window.pwned = 1'> $x_1$ & <b>bold</b>"

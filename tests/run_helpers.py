@@ -7,7 +7,7 @@ import sys
 import time
 from pathlib import Path
 
-from osel_sim import content
+from osel_sim.core import content
 
 PLUGIN = '''
 """Two policies without weights: they look at the picture and the instruction, and reach for nothing in particular."""

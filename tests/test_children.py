@@ -11,7 +11,7 @@ from remote_helpers import alive
 SCRIPT = """
 import multiprocessing, os, time
 from concurrent.futures import ProcessPoolExecutor
-from osel_sim.children import end_with_parent
+from osel_sim.core.processes import end_with_parent
 
 if __name__ == "__main__":
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), end_with_parent) as pool:

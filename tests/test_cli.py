@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from osel_sim import cli
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 
 
 def parser() -> cli.Parser:

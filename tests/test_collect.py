@@ -5,11 +5,11 @@ import sys
 import numpy as np
 import pytest
 
-from osel_sim import content
-from osel_sim.demonstrations import Shard, record_shard
+from osel_sim.core import content
 from osel_sim.formats.task_file import load_task_file
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.instance import make_instance
+from osel_sim.training.demonstrations import Shard, record_shard
 
 TASK = content.find("tasks", "pick_place")
 

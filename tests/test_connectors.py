@@ -18,15 +18,17 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_STATE
 
-from osel_sim import content, doctor
-from osel_sim.errors import CheckpointError, ContentError, PolicyError, RemoteError, UsageError
+from osel_sim import doctor
+from osel_sim.core import content
+from osel_sim.core.errors import CheckpointError, ContentError, PolicyError, RemoteError, UsageError
+from osel_sim.episodes.drivers import choose_policies
+from osel_sim.formats import library
 from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.mapping import actions_of, euler, message_of, quaternion, state_of
 from osel_sim.policy.registry import load_policy
 from osel_sim.remote.policy import open_remote
-from osel_sim.runtime.drivers import choose_policies
 
 SIZE = 32
 STATE = np.array([0.1, 0.2, 1.0, np.pi / 2, 0.0, 0.0, 0.04, -0.04], np.float32)
@@ -148,7 +150,7 @@ def save_act(folder: Path, state: int = 8, action: int = 7, statistics: bool = T
 
 def spec_of(folder: Path, **mapping: Any) -> Any:
     given = {"images": {"agentview": "observation.images.image", "wrist": "observation.images.image2"}} | mapping
-    local = content.load_policy("local_small")
+    local = library.load_policy("local_small")
     return dataclasses.replace(local, cameras=("agentview", "wrist"), image_size=SIZE, checkpoint=str(folder), mapping=Conventions(**given))
 
 

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from osel_sim import content
-from osel_sim.errors import ContentError, UnknownNameError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import ContentError, UnknownNameError, UsageError
+from osel_sim.formats import library
 from osel_sim.formats.policy_file import load_policy_file
 
 
@@ -27,10 +28,10 @@ def test_shipped_content_is_found() -> None:
 
 @pytest.mark.parametrize("name", sorted(content.files("policies")))
 def test_every_shipped_policy_loads_and_its_fallback_is_a_local_one(name: str) -> None:
-    spec = content.load_policy(name)
+    spec = library.load_policy(name)
     assert spec.name == name
     if spec.remote is not None and spec.remote.fallback is not None:
-        assert not content.load_policy(spec.remote.fallback).is_remote
+        assert not library.load_policy(spec.remote.fallback).is_remote
 
 
 def test_a_users_folder_adds_and_wins(tmp_path: Path) -> None:
@@ -39,7 +40,7 @@ def test_a_users_folder_adds_and_wins(tmp_path: Path) -> None:
     found = content.files("policies", tmp_path)
     assert {"mine", "local_small"} <= set(found)
     assert found["remote_large"] == mine
-    remote = content.load_policy("remote_large", tmp_path).remote
+    remote = library.load_policy("remote_large", tmp_path).remote
     assert remote is not None and remote.network == "lte"
 
 

@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from osel_sim import content
 from osel_sim.context.cache import ContextCache
-from osel_sim.context.captions import PLACES, Caption, Captions, truth
-from osel_sim.context.encoder import Encoder, encode_many, load_encoder
-from osel_sim.context.evaluate import measure, neighbour_agreement
-from osel_sim.context.scenes import Scenes, render_scenes
-from osel_sim.errors import CheckpointError, DataError, UnknownNameError, UsageError
+from osel_sim.context.encoder import encode_many, load_encoder
+from osel_sim.core import content
+from osel_sim.core.errors import CheckpointError, DataError, UnknownNameError, UsageError
 from osel_sim.formats.task_file import TaskSpec, load_task_file
+from osel_sim.interface.encoder import Encoder
+from osel_sim.training.encoder.captions import PLACES, Caption, Captions, truth
+from osel_sim.training.encoder.evaluate import measure, neighbour_agreement
+from osel_sim.training.encoder.scenes import Scenes, render_scenes
 
 TINY = "tiny_open_clip"
 
@@ -44,7 +45,7 @@ def contexts(encoder: Encoder, scenes: Scenes) -> np.ndarray:
 
 
 def test_importing_the_package_imports_no_torch() -> None:
-    code = "import sys, osel_sim.context.encoder, osel_sim.context.cache, osel_sim.context.train as train; "
+    code = "import sys, osel_sim.context.encoder, osel_sim.context.cache, osel_sim.training.encoder.train as train; "
     code += "print([name for name in ('torch', 'open_clip', 'mujoco') if name in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
 
@@ -271,7 +272,7 @@ def test_an_instruction_is_drawn_to_its_task_where_there_are_several() -> None:
     import open_clip
     import torch
 
-    from osel_sim.context.recipe import MODEL, Objective
+    from osel_sim.training.encoder.recipe import MODEL, Objective
 
     model = open_clip.CLIP(**MODEL)
     both, one = Objective(model, {"lift": 1, "push": 1}), Objective(model, {"lift": 1})
@@ -281,9 +282,9 @@ def test_an_instruction_is_drawn_to_its_task_where_there_are_several() -> None:
 
 
 def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from osel_sim.context import recipe
-    from osel_sim.context import train as training
-    from osel_sim.context.train import Settings, train
+    from osel_sim.training.encoder import recipe
+    from osel_sim.training.encoder import train as training
+    from osel_sim.training.encoder.train import Settings, train
 
     settings = Settings(tasks=("pick_place", "sort"), levels=(0, 2), steps=4, scenes=24, test_scenes=12, views=8, texts=8)
     whole = train(settings, tmp_path, tmp_path / "whole")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from osel_sim import content, doctor
+from osel_sim import doctor
+from osel_sim.core import content
 from osel_sim.doctor import Check
 
 

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from osel_sim import content
-from osel_sim.episode import Driver, Frame, Subscriber, delay_steps, episode_seed, run_episode
+from osel_sim.core import content
+from osel_sim.episodes.loop import Driver, Frame, Subscriber, delay_steps, episode_seed, run_episode
+from osel_sim.episodes.subscribers import RealTime
+from osel_sim.episodes.video import Video
 from osel_sim.formats.policy_file import PolicySpec, Price, Remote
 from osel_sim.formats.task_file import load_task_file
-from osel_sim.policy.call import Call
-from osel_sim.runtime.subscribers import RealTime
-from osel_sim.runtime.video import Video
+from osel_sim.interface.call import Call
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.expert import Expert
 from osel_sim.sim.instance import make_instance

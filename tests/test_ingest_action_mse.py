@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from synthetic_demonstrations import STEPS, write
 
-from osel_sim import content, ingest
+from osel_sim import ingest
 from osel_sim.context.cache import ContextCache
-from osel_sim.episode import Driver
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
+from osel_sim.episodes.loop import Driver
+from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.ingestion.action_mse import Settings, action_mse, measure_one, open_datasets
-from osel_sim.policy.call import LocalCaller
+from osel_sim.policy.local import LocalCaller
 
 EPISODES = 2
 
@@ -28,7 +29,7 @@ def test_error_by_hand():
 
 
 def test_samples_are_spread_over_each_episode_and_are_what_was_logged(dataset):
-    samples = open_datasets([dataset], [content.load_policy("local_small")], Settings(frames=3))
+    samples = open_datasets([dataset], [library.load_policy("local_small")], Settings(frames=3))
     assert [sample.instance.key for sample in samples[:3]] == ["flat_world/000000/000000", "flat_world/000000/000004", "flat_world/000000/000008"]
     assert len(samples) == 3 * EPISODES
     last = samples[-1]
@@ -58,7 +59,7 @@ class Replays:
 
 
 def test_who_knows_the_answer_has_no_error_and_a_crash_is_no_score(dataset):
-    spec = content.load_policy("local_small")
+    spec = library.load_policy("local_small")
     sample = open_datasets([dataset], [spec], Settings(frames=3))[2]
     logged = np.zeros((50, 7), np.float32)
     own = sample.dataset.actions[sample.frame : sample.end]
@@ -87,14 +88,14 @@ def test_shipped_policies_are_measured(dataset, tmp_path):
     assert [row.success for row in rows] == [row.score >= -0.3 for row in rows]
     local, remote = rows[:2]
     assert (local.task, local.upload, local.inference, local.price, local.calls, local.actions) == ("flat_world", 0.0, 0.015, 0.0, 1, 8)
-    assert remote.upload > 0 and remote.download > 0 and remote.price == pytest.approx(content.load_policy("remote_large").price.of(8, 1, 0.0))
+    assert remote.upload > 0 and remote.download > 0 and remote.price == pytest.approx(library.load_policy("remote_large").price.of(8, 1, 0.0))
     assert (local.steps, local.subgoals, local.motion) == (None, None, None)
     assert metadata["source"] == {"metric": "action-mse", "datasets": ["flat_world"], "frames": 2, "tolerance": 0.3}
     assert len(ContextCache(out).table(metadata["encoder"], [row.instance for row in rows])) == len(rows)
 
 
 def test_bad_datasets_get_one_line(dataset, tmp_path, capsys):
-    spec = [content.load_policy("remote_large")]
+    spec = [library.load_policy("remote_large")]
     with pytest.raises(DataError, match=r"is no LeRobotDataset, it has no meta/info\.json"):
         open_datasets([tmp_path], spec, Settings())
     with pytest.raises(DataError, match=r"no images 'observation\.images\.top' .*--camera wrist=COLUMN"):
@@ -106,7 +107,7 @@ def test_bad_datasets_get_one_line(dataset, tmp_path, capsys):
     for file in other.glob("data/**/*.parquet"):
         file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(DataError, match="one_eye: cannot be read as a LeRobotDataset"):
-        open_datasets([other], [content.load_policy("local_small")], Settings())
+        open_datasets([other], [library.load_policy("local_small")], Settings())
     flags = ["--metric", "action-mse", "--dataset", str(dataset), "--policies", "local_small", "--out", str(tmp_path / "log")]
     assert ingest.main([*flags, "--camera", "wrist"]) == 2
     assert ingest.main([*flags, "--camera", "wrist=observation.images.wrist"]) == 2

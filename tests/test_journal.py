@@ -5,9 +5,9 @@ from dataclasses import asdict
 
 import pytest
 
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
 from osel_sim.formats.journal import Decision, Lines, read_journal, to_line
-from osel_sim.formats.outcome import Seconds
+from osel_sim.interface.outcome import Seconds
 
 FIELDS = [
     "index",

@@ -6,8 +6,8 @@ import itertools
 
 import pytest
 
-from osel_sim import content
-from osel_sim.errors import ContentError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import ContentError, UsageError
 from osel_sim.formats.levels import AXES, label, parse_axes, resolve, split_off
 from osel_sim.formats.task_file import load_task_file
 from osel_sim.sim.instance import SPLITS, make_instance

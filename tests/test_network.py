@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from osel_sim.errors import UnknownNameError
+from osel_sim.core.errors import UnknownNameError
 from osel_sim.formats.policy_file import NETWORKS
 from osel_sim.remote.network import PROFILES, Delays, NetworkModel, NetworkProfile, profile
 

@@ -7,14 +7,14 @@ import pytest
 from report_helpers import FAR, NEAR, WEIGHTS, made_log
 from synthetic_log import make_row, write_log
 
-from osel_sim.errors import DataError
-from osel_sim.offline.clusters import describe, find_clusters, inequality
-from osel_sim.offline.contexts import best_policies, lay_out, wording
-from osel_sim.offline.estimate import rate_of
-from osel_sim.offline.frontier import frontiers
-from osel_sim.offline.log import read_log
-from osel_sim.offline.outcomes import outcome_rates, per_group, remote_policies
-from osel_sim.offline.weights_map import swept, trivial_ranges, weights_map
+from osel_sim.analysis.clusters import describe, find_clusters, inequality
+from osel_sim.analysis.contexts import best_policies, lay_out, wording
+from osel_sim.analysis.estimate import rate_of
+from osel_sim.analysis.frontier import frontiers
+from osel_sim.analysis.log import read_log
+from osel_sim.analysis.outcomes import outcome_rates, per_group, remote_policies
+from osel_sim.analysis.weights_map import swept, trivial_ranges, weights_map
+from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
 
 REMOTE = np.array([False, True])

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from osel_sim import replay
+from osel_sim.analysis.evaluation import evaluate
+from osel_sim.analysis.live import is_live_run, read_live
 from osel_sim.context.cache import ContextCache
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
+from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, to_line
-from osel_sim.formats.outcome import Outcome, Seconds
 from osel_sim.formats.replay_result import read_replay
-from osel_sim.formats.run_config import read_json
-from osel_sim.offline.evaluation import evaluate
-from osel_sim.offline.live import is_live_run, read_live
+from osel_sim.interface.outcome import Outcome, Seconds
 from osel_sim.selection.reward import RewardWeights
 
 FREE = RewardWeights(0.0, 0.0)

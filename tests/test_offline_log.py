@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from synthetic_log import clusters, make_row, write_log
 
-from osel_sim.content import root
-from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.analysis.log import read_log
+from osel_sim.core.content import root
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import read_rollouts
-from osel_sim.offline.log import read_log
 from osel_sim.selection.reward import PRESETS, RewardWeights, reward
 
 SHIPPED = root() / "assets" / "logs" / "pick_place"

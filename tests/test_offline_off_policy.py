@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from osel_sim.errors import UsageError
-from osel_sim.offline.off_policy import estimate, forward_model, greedy
+from osel_sim.analysis.off_policy import estimate, forward_model, greedy
+from osel_sim.core.errors import UsageError
 
 RATES = np.array([[0.9, 0.3], [0.2, 0.6]])  # by kind of instance and policy
 VALUES = RATES.mean(axis=0)

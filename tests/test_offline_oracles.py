@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from synthetic_log import clusters, make_row, write_log
 
-from osel_sim.errors import DataError, UsageError
-from osel_sim.offline.log import read_log
-from osel_sim.offline.measures import Curves, gap_closed
-from osel_sim.offline.oracles import expected_oracle, oracles
-from osel_sim.offline.sequential import advantage_bounds
-from osel_sim.offline.streams import complete_instances, draw_streams
+from osel_sim.analysis.log import read_log
+from osel_sim.analysis.measures import Curves, gap_closed
+from osel_sim.analysis.oracles import expected_oracle, oracles
+from osel_sim.analysis.streams import complete_instances, draw_streams
+from osel_sim.core.errors import DataError, UsageError
 from osel_sim.selection.reward import RewardWeights
-from osel_sim.statistics import RESAMPLES
+from osel_sim.statistics.betting import advantage_bounds
+from osel_sim.statistics.intervals import RESAMPLES
 
 FREE = RewardWeights(0.0, 0.0)
 

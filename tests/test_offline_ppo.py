@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from osel_sim.offline.engine import replay_one
-from osel_sim.offline.fast_ppo import FastPPO, supports
+from osel_sim.analysis.engine import replay_one
+from osel_sim.selection.ppo.compiled import FastPPO, supports
 from osel_sim.selection.registry import make_selector
 
 POLICIES = ("a", "b", "c")

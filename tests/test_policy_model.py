@@ -14,14 +14,14 @@ from lerobot.policies.act.modeling_act import ACTPolicy
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_TOKENS, OBS_STATE
 
-from osel_sim import content
-from osel_sim.errors import CheckpointError
+from osel_sim.core.errors import CheckpointError
+from osel_sim.core.torch_settings import threads
+from osel_sim.formats import library
 from osel_sim.formats.conventions import Conventions
 from osel_sim.policy.language_chunk import LanguageChunkConfig, LanguageChunkPolicy, make_language_chunk_pre_post_processors
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.processing import area_weights, rotation_columns
 from osel_sim.policy.text import PADDING, embed, tokenise
-from osel_sim.threads import threads
 from osel_sim.training.recipe import find_recipe, load_recipe
 
 SIZE = 32
@@ -63,7 +63,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def spec_of(folder: Path | str, **changes: Any) -> Any:
-    return dataclasses.replace(content.load_policy("local_small"), checkpoint=str(folder), **changes)
+    return dataclasses.replace(library.load_policy("local_small"), checkpoint=str(folder), **changes)
 
 
 def act(folder: Path, instruction: str = INSTRUCTION, **changes: Any) -> np.ndarray:
@@ -260,7 +260,7 @@ def test_a_hub_name_without_access_ends_soon_in_one_line(monkeypatch: pytest.Mon
 @pytest.mark.parametrize(("name", "most_parameters", "most_seconds"), [("local_small", 5e6, 0.15), ("remote_large", 8e6, 0.4)])
 def test_sizes_and_latency_of_the_recipes(name: str, most_parameters: float, most_seconds: float) -> None:
     """The limit of local_small is 15 ms on an idle core; ten times that is allowed for a busy machine."""
-    spec, recipe = content.load_policy(name), load_recipe(find_recipe(name))
+    spec, recipe = library.load_policy(name), load_recipe(find_recipe(name))
     config = make_policy_config(recipe.type, **features(spec.cameras), **recipe.model)
     policy = get_policy_class(recipe.type)(config)
     assert sum(parameter.numel() for parameter in policy.parameters()) <= most_parameters

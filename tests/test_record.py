@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
 
-from osel_sim import content, record
+from osel_sim import record
+from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
+from osel_sim.core import content
+from osel_sim.core.files import digest
+from osel_sim.episodes.workers import Plan
+from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts
-from osel_sim.formats.run_config import digest
 from osel_sim.formats.task_file import load_task_file
-from osel_sim.offline.log import read_log
-from osel_sim.runtime.workers import Plan
 
 INSTANCES, REPEATS = 5, 2
 SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)
@@ -50,7 +52,7 @@ def resume(world: Path, folder: Path, *flags: object) -> subprocess.CompletedPro
 
 
 def test_repeats_are_of_all_levels():
-    task, policy = load_task_file(content.find("tasks", "lift")), content.load_policy("local_small")
+    task, policy = load_task_file(content.find("tasks", "lift")), library.load_policy("local_small")
     plan = Plan((task,), (policy,), (policy,), range(40), (0, 2), "test", "osel_small", repeats=3, repeat_every=10)
     repeated = [plan.instances[key] for key in plan.instances if len(plan.episodes(key)) == 3]
     assert sorted(instance.level for instance in repeated) == [0, 0, 2, 2]

@@ -11,7 +11,7 @@ import pytest
 from openpi_client import msgpack_numpy
 from remote_helpers import GREETING, TOKEN, Sinusoid, observation, serving, serving_with
 
-from osel_sim.errors import RemoteError
+from osel_sim.core.errors import RemoteError
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.codec import pack, unpack
 from osel_sim.remote.protocol import RESET, Greeting

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from remote_helpers import GREETING, TOKEN, Sinusoid, alive, install_plugin, observation, policy_spec, serving, serving_with
 
-from osel_sim.errors import RemoteError, UsageError
-from osel_sim.policy.call import Call, LocalCaller
+from osel_sim.core.errors import RemoteError, UsageError
+from osel_sim.interface.call import Call
+from osel_sim.policy.local import LocalCaller
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.codec import pack
 from osel_sim.remote.network import PROFILES, NetworkModel, NetworkProfile

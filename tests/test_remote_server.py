@@ -11,7 +11,7 @@ from remote_helpers import GREETING, TOKEN, Sinusoid, observation, serving
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from osel_sim.errors import PolicyError, RemoteError, UsageError
+from osel_sim.core.errors import PolicyError, RemoteError, UsageError
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.codec import pack, unpack
 from osel_sim.remote.protocol import RESET

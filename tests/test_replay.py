@@ -15,15 +15,15 @@ import pytest
 from synthetic_log import clusters, make_row, write_log
 
 from osel_sim import replay, report
-from osel_sim.errors import DataError
+from osel_sim.analysis.engine import Setup
+from osel_sim.analysis.engine import replay as replay_all
+from osel_sim.analysis.log import read_log
+from osel_sim.analysis.measures import Curves, gap_closed
+from osel_sim.core.errors import DataError
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.formats.rollout_log import write_rollouts
-from osel_sim.offline.engine import Setup
-from osel_sim.offline.engine import replay as replay_all
-from osel_sim.offline.log import read_log
-from osel_sim.offline.measures import Curves, gap_closed
 from osel_sim.selection.reward import RewardWeights
-from osel_sim.statistics import RESAMPLES
+from osel_sim.statistics.intervals import RESAMPLES
 
 FREE = ["--alpha-time", "0", "--alpha-price", "0", "--workers", "1", "--no-frontier"]
 

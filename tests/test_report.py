@@ -16,18 +16,18 @@ from report_helpers import EVIL, FAR, NEAR, WEIGHTS, made_log, made_replay, made
 from synthetic_log import make_row, write_log
 
 from osel_sim import report
-from osel_sim.errors import UsageError
-from osel_sim.offline.estimate import Estimate, mean_of, rate_of
-from osel_sim.offline.log import read_log
+from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
+from osel_sim.analysis.log import read_log
+from osel_sim.core.errors import UsageError
+from osel_sim.episodes.tensorboard import check_installed
 from osel_sim.reporting import episodes
 from osel_sim.reporting.description import DARK, LIGHT, Bars, Column, Figure, Heat, Line, Panel, Points, Table, colours, thinned
 from osel_sim.reporting.episodes import MOST_EPISODES, list_episodes
+from osel_sim.reporting.html_tables import to_csv, to_text
 from osel_sim.reporting.log_sections import context_figure, policy_blocks, time_figure
 from osel_sim.reporting.matplotlib_figures import to_images
 from osel_sim.reporting.plotly_figures import to_plotly
 from osel_sim.reporting.selector_sections import MAIN, style_of
-from osel_sim.reporting.tables import to_csv, to_text
-from osel_sim.runtime.tensorboard import check_installed
 
 
 @pytest.fixture(scope="module")

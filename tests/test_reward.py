@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from osel_sim.errors import UnknownNameError, UsageError
-from osel_sim.formats.outcome import Outcome, Seconds
+from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.interface.outcome import Outcome, Seconds
 from osel_sim.selection.reward import FLOOR_SECONDS, PRESETS, RewardWeights, preset, reward, total_seconds
 
 REMOTE = Outcome(True, 0.75, 200, Seconds(upload=1.0, inference=2.0, download=0.5, motion=10.0), calls=4, actions=120, price=8.0)

@@ -8,10 +8,10 @@ import pyarrow.parquet
 import pytest
 from rich.console import Console
 
-from osel_sim.errors import DataError, UsageError
+from osel_sim.cli.rollout_tables import print_rollouts, share_best
+from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.rollout_log import SCHEMA_VERSION, Row, read_rollouts, schema, write_rollouts
 from osel_sim.formats.shards import SHARDS, Shards
-from osel_sim.runtime.rollout_tables import print_rollouts, share_best
 from osel_sim.selection.reward import RewardWeights, logged_reward, preset, reward
 
 COLUMNS = [

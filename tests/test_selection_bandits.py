@@ -5,8 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from osel_sim.errors import UsageError
-from osel_sim.offline.engine import replay_one
+from osel_sim.analysis.engine import replay_one
+from osel_sim.core.errors import UsageError
 from osel_sim.replay import choose_selectors
 from osel_sim.selection.registry import make_selector, setting_names
 from osel_sim.selection.thompson import probability_of_best

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from osel_sim.costs import expected_costs
-from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.episodes.expected_costs import expected_costs
 from osel_sim.formats.policy_file import PolicySpec, Price, Remote
 from osel_sim.selection.bayesian import highest
 from osel_sim.selection.features import Components, Landmarks, Sketch

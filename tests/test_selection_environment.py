@@ -7,7 +7,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3 import A2C, DQN
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 from osel_sim.selection.environment import SelectionEnv, table_rounds
 
 POLICIES = ("local", "remote")

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
 from osel_sim.selection.oracle import best_single, compare, cumulative_regret, hindsight
 
 REWARDS = [[1.0, 0.5], [0.0, 0.5], [1.0, 0.8], [0.0, 0.4]]

@@ -8,10 +8,10 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
-from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.interface.selector import Choice
 from osel_sim.selection.environment import SelectionEnv, table_rounds
-from osel_sim.selection.ppo import PPOSelector
-from osel_sim.selection.protocol import Choice
+from osel_sim.selection.ppo.sb3 import PPOSelector
 from osel_sim.selection.state import load_state, save_state
 
 POLICIES = ("a", "b", "c")

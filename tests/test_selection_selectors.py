@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.interface.selector import Choice
 from osel_sim.selection.epsilon_greedy import EpsilonGreedySelector
-from osel_sim.selection.protocol import Choice
 from osel_sim.selection.registry import BUILT_IN, make_selector, selector_locations
 from osel_sim.selection.state import load_state, save_state
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
 from osel_sim.selection.state import load_state, save_state
 
 STATE = {

@@ -15,7 +15,7 @@ import pytest
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from remote_helpers import TOKEN, install_plugin, observation, policy_spec
 
-from osel_sim.errors import RemoteError
+from osel_sim.core.errors import RemoteError
 from osel_sim.remote.client import RemoteClient
 
 COMMAND = [sys.executable, "-m", "osel_sim.serve"]

@@ -6,9 +6,10 @@ import json
 import pytest
 from safetensors import safe_open
 
-from osel_sim import content
-from osel_sim.episode import Driver, run_episode
-from osel_sim.policy.call import LocalCaller
+from osel_sim.core import content
+from osel_sim.episodes.loop import Driver, run_episode
+from osel_sim.formats import library
+from osel_sim.policy.local import LocalCaller
 from osel_sim.policy.registry import make_policy
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.instance import make_instance
@@ -23,7 +24,7 @@ INSTANCES = 12
 )
 def test_solves_unseen_instances(name, task, at_least):
     env = TaskEnv(task)
-    spec = dataclasses.replace(content.load_policy(name), remote=None)
+    spec = dataclasses.replace(library.load_policy(name), remote=None)
     driver = Driver(spec, LocalCaller(make_policy(spec), spec))
     outcomes = []
     for seed in range(INSTANCES):
@@ -43,13 +44,13 @@ def test_loads_through_lerobots_own_from_pretrained(name):
     from osel_sim.policy import register
 
     register()
-    folder = content.resolve_checkpoint(content.load_policy(name).checkpoint)
+    folder = content.resolve_checkpoint(library.load_policy(name).checkpoint)
     policy = get_policy_class(PreTrainedConfig.from_pretrained(folder).type).from_pretrained(folder)
     assert not any("annotation" in key for key in policy.config.input_features)  # nothing privileged
 
 
 def test_local_small_is_small():
-    folder = content.resolve_checkpoint(content.load_policy("local_small").checkpoint)
+    folder = content.resolve_checkpoint(library.load_policy("local_small").checkpoint)
     with safe_open(f"{folder}/model.safetensors", "np") as file:
         sizes = [file.get_slice(key).get_shape() for key in file.keys()]  # noqa: SIM118 (not a dictionary)
     parameters = 0
@@ -63,7 +64,7 @@ def test_local_small_is_small():
 
 @pytest.mark.parametrize("name", POLICIES)
 def test_says_how_it_was_made(name):
-    folder = content.resolve_checkpoint(content.load_policy(name).checkpoint)
+    folder = content.resolve_checkpoint(library.load_policy(name).checkpoint)
     report = json.loads((folder / "training.json").read_text())
     assert report["command"].startswith(f"python -m osel_sim.train --policy {name}")
     assert all(dataset["trained_on"] > 0 for dataset in report["datasets"])

@@ -2,8 +2,8 @@ import dataclasses
 
 import pytest
 
-from osel_sim import content
-from osel_sim.errors import ContentError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import ContentError, UsageError
 from osel_sim.formats.task_file import load_task_file
 from osel_sim.sim.instance import GAP, SPLITS, make_instance
 

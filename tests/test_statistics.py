@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from osel_sim.errors import UsageError
-from osel_sim.statistics import bootstrap_mean_interval, wilson_interval
+from osel_sim.core.errors import UsageError
+from osel_sim.statistics.intervals import bootstrap_mean_interval, wilson_interval
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from osel_sim.context.encoder import load_encoder
 from osel_sim.context.text_encoders import TextOnly, TfidfEncoder, load_log_encoder
-from osel_sim.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
 
 BODIES = ["the bone of the arm", "a bone in the hand", "blood and the heart", "the heart and its blood vessels", "bone and blood", "hand and arm"]
 SKIES = ["planets around the sun", "the sun and a star", "a star and its planets", "moons of planets", "the moon and the sun", "star and moon"]

@@ -17,8 +17,8 @@ import torch
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file
 
-from osel_sim import content
-from osel_sim.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
+from osel_sim.formats import library
 from osel_sim.policy.language_chunk import LanguageChunkPolicy
 from osel_sim.train import main
 from osel_sim.training.batches import Batches, frames_of, statistics_of
@@ -44,7 +44,7 @@ def recipe(**optimisation: Any) -> Recipe:
 
 
 def run(folder: Path, data: Path, steps: int, **options: Any) -> dict[str, Any]:
-    spec = replace(content.load_policy("local_small"), image_size=48)
+    spec = replace(library.load_policy("local_small"), image_size=48)
     return train(spec, recipe(steps=steps), [data], Options(out=folder, threads=1, **options))
 
 
@@ -242,7 +242,7 @@ def test_half_precision_is_half_the_size_and_loads(tmp_path: Path, demonstration
 
 def test_training_begins_with_a_checkpoint(tmp_path: Path, demonstrations: Path) -> None:
     run(tmp_path / "first", demonstrations, 3)
-    spec = replace(content.load_policy("local_small"), image_size=48)
+    spec = replace(library.load_policy("local_small"), image_size=48)
     still = recipe(steps=1, learning_rate=0.0)
     options = Options(out=tmp_path / "second", threads=1, seed=5, init=tmp_path / "first")
     result = train(spec, replace(still, episodes=3), [demonstrations], options)  # another seed, other statistics

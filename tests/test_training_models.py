@@ -12,8 +12,8 @@ import torch
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from safetensors.torch import load_file
 
-from osel_sim import content
-from osel_sim.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
+from osel_sim.formats import library
 from osel_sim.policy import register
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.training.annotations import load_annotations
@@ -55,7 +55,7 @@ def recipe(kind: str, **optimisation: Any) -> Recipe:
 
 
 def run(kind: str, folder: Path, data: list[Path], steps: int, changes: dict[str, Any] | None = None, **options: Any) -> dict[str, Any]:
-    spec = replace(content.load_policy("local_small"), image_size=48)
+    spec = replace(library.load_policy("local_small"), image_size=48)
     return train(spec, replace(recipe(kind, steps=steps), **(changes or {})), data, Options(out=folder, threads=1, **options))
 
 
@@ -77,7 +77,7 @@ def test_a_checkpoint_drives_after_a_few_steps_and_resumes_to_the_same_weights(k
     learned = [value for name, value in first.items() if "normalizer" not in name and value.is_floating_point()]
     assert {value.dtype for value in learned} == {torch.float16}
 
-    spec = replace(content.load_policy("local_small"), checkpoint=str(tmp_path / "straight"), image_size=48)
+    spec = replace(library.load_policy("local_small"), checkpoint=str(tmp_path / "straight"), image_size=48)
     random = np.random.default_rng(0)
     positions, present, _ = world.scene(random)
     gripper = np.array([0.0, 0.0, 0.8])
@@ -129,7 +129,7 @@ def test_act_moves_to_what_its_perception_found(tmp_path: Path) -> None:
     result = run("act", tmp_path / "out", [data], 1200, evaluate_every=1200, changes={"optimisation": settings})
     final = result["validation"][-1]
     assert final["object_cm"] < 5 and final["container_cm"] < 5 and final["action_error"] < 0.2
-    policy = load(replace(content.load_policy("local_small"), checkpoint=str(tmp_path / "out"), image_size=48))()
+    policy = load(replace(library.load_policy("local_small"), checkpoint=str(tmp_path / "out"), image_size=48))()
     random, approached = np.random.default_rng(9), 0
     for _ in range(40):
         positions, present, target = world.scene(random)
@@ -144,7 +144,7 @@ def test_act_moves_to_what_its_perception_found(tmp_path: Path) -> None:
 
 def test_what_acts_perception_looks_at_must_be_given(tmp_path: Path, demonstrations: Path) -> None:
     run("act", tmp_path / "out", [demonstrations], 1)
-    spec = replace(content.load_policy("local_small"), checkpoint=str(tmp_path / "out"), cameras=("wrist",))
+    spec = replace(library.load_policy("local_small"), checkpoint=str(tmp_path / "out"), cameras=("wrist",))
     with pytest.raises(CheckpointError, match=r"it wants observation\.images\.agentview, the policy file gives observation\.images\.wrist"):
         load(spec)
 
@@ -157,7 +157,7 @@ def test_sizes_that_do_not_fit_are_one_line(tmp_path: Path, demonstrations: Path
 def test_act_and_its_perception_begin_with_a_checkpoint(tmp_path: Path, demonstrations: Path) -> None:
     run("act", tmp_path / "first", [demonstrations], 2)
     still = recipe("act", steps=1, learning_rate=0.0)
-    spec = replace(content.load_policy("local_small"), image_size=48)
+    spec = replace(library.load_policy("local_small"), image_size=48)
     train(spec, still, [demonstrations], Options(out=tmp_path / "second", threads=1, seed=5, init=tmp_path / "first"))
     first, second = weights(tmp_path / "first"), weights(tmp_path / "second")
     assert any("perception" in name for name in first)

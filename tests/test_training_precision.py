@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.profiler import ProfilerActivity, profile
 
-from osel_sim.precision import computes_bfloat16
+from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.training.loop import Trainer
 from osel_sim.training.recipe import Optimisation
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from osel_sim import content
+from osel_sim.core import content
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 COMMANDS = sorted(file.stem for file in (CHECKOUT / "osel_sim").glob("*.py") if '__name__ == "__main__"' in file.read_text())

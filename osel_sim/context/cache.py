@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from osel_sim.context.encoder import Context, Encoder, Image
-from osel_sim.errors import DataError, UsageError
+from osel_sim.core.errors import DataError, UsageError
+from osel_sim.interface.encoder import Context, Encoder, Image
 
 FILE = "contexts.npz"
 EXAMPLE = "skill:"

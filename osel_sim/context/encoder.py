@@ -8,43 +8,21 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.content import root
-from osel_sim.errors import CheckpointError, UnknownNameError, UsageError
-from osel_sim.hub import offline_if_unreachable
-
-Context = NDArray[np.float32]
-Image = NDArray[np.uint8]
+from osel_sim.core.content import root
+from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.hub import offline_if_unreachable
+from osel_sim.interface.encoder import Context, Encoder, Image
 
 DEFAULT_ENCODER = "osel_small"
 WEIGHTS = "open_clip_model.safetensors"
 CONFIG = "open_clip_config.json"
 VOCABULARY = "bpe_vocabulary.txt.gz"
 ENTRY_POINTS = "osel_sim.encoders"
-
-
-class Encoder(Protocol):
-    """Turns an instance into its context c = g(x). The same input gives the same bits.
-
-    Attributes:
-        name: what `load_encoder` was asked for.
-        identity: the name and a digest of the weights where those can change under the same name; keys the context cache.
-        dimension: length d of a context.
-        image_size: side in pixels of the square image it works on; a larger or smaller one is resized.
-    """
-
-    name: str
-    identity: str
-    dimension: int
-    image_size: int
-
-    def encode(self, images: Sequence[Image], instruction: str) -> Context:
-        """Context (d,) float32 of one instance, from one or more uint8 (H, W, 3) RGB images and its instruction."""
-        ...
 
 
 def embedded_encoders() -> dict[str, Path]:

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.encoder import Context, Encoder, Image, OpenClipEncoder, digest, load_encoder
-from osel_sim.errors import CheckpointError, UnknownNameError, UsageError
-from osel_sim.hub import offline_if_unreachable
+from osel_sim.context.encoder import OpenClipEncoder, digest, load_encoder
+from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
+from osel_sim.core.hub import offline_if_unreachable
+from osel_sim.interface.encoder import Context, Encoder, Image
 
 SENTENCE = "sentence:"
 TFIDF = "tfidf"

@@ -10,7 +10,6 @@ from pydantic import Field, ValidationInfo, field_validator
 from pydantic.dataclasses import dataclass
 from pydantic_core import PydanticKnownError
 
-from osel_sim.formats.task_file import Entity
 from osel_sim.formats.terms import KINDS
 from osel_sim.formats.toml_file import load_toml
 from osel_sim.formats.toml_types import TABLE, Number, Texts, Version, between, refuse, shown, unknown_value
@@ -153,6 +152,32 @@ def _faults(things: Mapping[str, Thing], before: Mapping[str, Mapping[str, objec
 
 
 @dataclasses.dataclass(frozen=True)
+class Entity:
+    """A thing of the catalogue that takes part in a task (`Thing` and those after it explain the fields).
+
+    One type for all kinds, so that code may ask any thing for any of it; what a kind does not have is 0, empty or no text.
+    """
+
+    name: str
+    kind: str
+    names: tuple[str, ...]
+    model: str
+    radius: float
+    size: tuple[float, ...] = ()
+    rgba: tuple[float, ...] = ()
+    grasp: float = 0.0
+    inner: float = 0.0
+    rim: float = 0.0
+    floor: float = 0.0
+    symmetry: int = 180
+    handle: str = ""
+    inside: str = ""
+    lean: float = 0.0
+    joint: str = ""
+    attributes: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
 class Catalogue:
     """Things by name, and properties by name with what people call the things that have them."""
 
@@ -171,7 +196,7 @@ def load_catalogue(file: Path | None = None) -> Catalogue:
 
 @functools.cache
 def _shipped() -> Catalogue:
-    from osel_sim import content
+    from osel_sim.core import content
 
     return _load(content.root() / "assets" / "objects" / "objects.toml")
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from osel_sim.errors import DataError
-from osel_sim.formats.outcome import Outcome, Seconds
+from osel_sim.core.errors import DataError
+from osel_sim.interface.outcome import Outcome, Seconds
 
 
 @dataclass(frozen=True)

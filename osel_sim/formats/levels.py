@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from osel_sim.errors import UnknownNameError, UsageError
+from osel_sim.core.errors import UnknownNameError, UsageError
 
 LEVELS = (0, 1, 2, 3)
 AXES = ("light", "camera", "texture", "distractors", "colours", "sizes", "start", "robot", "phrasing")

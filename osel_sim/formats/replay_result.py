@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import DataError, UsageError
-from osel_sim.formats.run_config import read_json, write_json
+from osel_sim.core.errors import DataError, UsageError
+from osel_sim.core.files import read_json, write_json
 
 SCHEMA_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"

@@ -14,8 +14,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.errors import DataError
-from osel_sim.formats.outcome import Outcome, Seconds
+from osel_sim.core.errors import DataError
+from osel_sim.interface.outcome import Outcome, Seconds
 
 if TYPE_CHECKING:
     import pyarrow

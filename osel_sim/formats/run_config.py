@@ -4,7 +4,6 @@ The configuration and the GL backend must be equal when a run is resumed. Versio
 that an uninterrupted run would have written.
 """
 
-import hashlib
 import importlib.metadata
 import json
 import os
@@ -14,8 +13,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from osel_sim import content
-from osel_sim.errors import DataError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import UsageError
+from osel_sim.core.files import digest, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.task_file import TaskSpec
 
@@ -51,15 +51,6 @@ def git_revision(root: Path) -> str | None:
         return revision + ("+changes" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file, or of all files of a folder with their names."""
-    total = hashlib.sha256()
-    for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-        if file.is_file():
-            total.update(file.relative_to(path).as_posix().encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
-    return total.hexdigest()
 
 
 def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -> dict[str, str]:
@@ -156,25 +147,3 @@ def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in data.items():
         result.update(_flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value})
     return result
-
-
-def write_json(file: Path, data: dict[str, Any]) -> None:
-    """Indented JSON, at once or not at all."""
-    partial = file.with_suffix(".partial")
-    partial.write_text(json.dumps(data, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
-    os.replace(partial, file)
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """A JSON object.
-
-    Raises:
-        DataError: the file is missing or holds something else.
-    """
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{file} cannot be read as JSON ({error})") from None
-    if not isinstance(data, dict):
-        raise DataError(f"{file}: expected an object, got {type(data).__name__}")
-    return data

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
 from osel_sim.formats.journal import Lines
 from osel_sim.formats.rollout_log import Row
 

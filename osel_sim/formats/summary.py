@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from osel_sim.formats.journal import Decision
-from osel_sim.statistics import wilson_interval
+from osel_sim.statistics.intervals import wilson_interval
 
 
 def summarise(decisions: Sequence[Decision], policies: Sequence[str], selector: str) -> dict[str, Any]:

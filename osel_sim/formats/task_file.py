@@ -1,73 +1,14 @@
-"""A task: scene, language, goal, subgoals and the expert's plan of one task family, as code wants them (task_schema has the file)."""
+"""A task: scene, language, goal, subgoals and the expert's plan of one task family, as code wants them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from pydantic.dataclasses import dataclass as pydantic_dataclass
-
+from osel_sim.formats.catalogue import Catalogue, Entity, load_catalogue
 from osel_sim.formats.levels import AXES
-from osel_sim.formats.terms import Term
-from osel_sim.formats.toml_types import TABLE, Interval
-
-if TYPE_CHECKING:
-    from osel_sim.formats.catalogue import Catalogue
-
-ATTRIBUTE = "attribute"
-"""Kind of a role that names a property (a rule such as "the red things") instead of a thing."""
-
-
-@pydantic_dataclass(frozen=True, config=TABLE)
-class Region:
-    """Where things of one kind start."""
-
-    x: Interval
-    """Range away from the robot, metres; 0 is the middle of the table."""
-    y: Interval
-    """Range to the left of the robot, metres; 0 is the middle of the table."""
-    yaw: Interval = (0.0, 0.0)
-    """Range of turns, radians."""
-
-
-@pydantic_dataclass(frozen=True, config=TABLE)
-class Sorting:
-    """A role filled by a rule: with `then` if the thing of role `thing` has the attribute of role `attribute`, else with `otherwise`."""
-
-    thing: str
-    """Unnamed role whose thing is looked at."""
-    attribute: str
-    """Role of kind `attribute` that names the property."""
-    then: str
-    """Role whose thing fills this one if that has the property."""
-    otherwise: str
-    """Role whose thing fills this one if it has not."""
-
-
-@dataclass(frozen=True)
-class Entity:
-    """A thing of the catalogue that takes part in a task (osel_sim.formats.catalogue explains the fields).
-
-    One type for all kinds, so that code may ask any thing for any of it; what a kind does not have is 0, empty or no text.
-    """
-
-    name: str
-    kind: str
-    names: tuple[str, ...]
-    model: str
-    radius: float
-    size: tuple[float, ...] = ()
-    rgba: tuple[float, ...] = ()
-    grasp: float = 0.0
-    inner: float = 0.0
-    rim: float = 0.0
-    floor: float = 0.0
-    symmetry: int = 180
-    handle: str = ""
-    inside: str = ""
-    lean: float = 0.0
-    joint: str = ""
-    attributes: tuple[str, ...] = ()
+from osel_sim.formats.task_schema import Region, Sorting, TaskFile
+from osel_sim.formats.terms import ATTRIBUTE, KINDS, Term
+from osel_sim.formats.toml_file import load_toml
 
 
 @dataclass(frozen=True)
@@ -122,7 +63,7 @@ class TaskSpec:
         return tuple(entity for entity in self.entities if entity.kind == kind)
 
 
-def load_task_file(file: Path, catalogue: "Catalogue | None" = None) -> TaskSpec:
+def load_task_file(file: Path, catalogue: Catalogue | None = None) -> TaskSpec:
     """Read and check a task file.
 
     Args:
@@ -131,9 +72,34 @@ def load_task_file(file: Path, catalogue: "Catalogue | None" = None) -> TaskSpec
     Raises:
         ContentError: naming the file, the key and what would be right.
     """
-    from osel_sim.formats.catalogue import load_catalogue
-    from osel_sim.formats.task_schema import TaskFile
-    from osel_sim.formats.toml_file import load_toml
-
     catalogue = load_catalogue() if catalogue is None else catalogue
-    return load_toml(TaskFile, file, {"catalogue": catalogue}).spec(file, catalogue)
+    return _spec(load_toml(TaskFile, file, {"catalogue": catalogue}), file, catalogue)
+
+
+def _spec(task: TaskFile, file: Path, catalogue: Catalogue) -> TaskSpec:
+    """The task as code wants it."""
+    entities = task.scene.entities(catalogue)
+    moving = [kind for kind in KINDS if any(entity.joint for entity in entities if entity.kind == kind)]
+    return TaskSpec(
+        name=task.name,
+        title=task.title,
+        version=task.version,
+        tags=task.tags,
+        horizon=task.horizon,
+        arena=task.scene.arena,
+        entities=entities,
+        distractors=task.scene.distractors,
+        regions={kind: task.scene.region[kind] for kind in KINDS if kind in task.scene.region},
+        starts={kind: task.scene.start.get(kind, (0.0, 0.0)) for kind in moving},
+        roles=task.roles,
+        unnamed={role: kind for role, kind in task.unnamed.items() if not isinstance(kind, Sorting)},
+        sorted_roles={role: rule for role, rule in task.unnamed.items() if isinstance(rule, Sorting)},
+        attributes=catalogue.attributes if ATTRIBUTE in task.roles.values() else {},
+        train=task.language.train,
+        held_out=task.language.held_out,
+        goal=task.goal.all,
+        subgoals=tuple(task.subgoals.items()),
+        plan=task.expert.plan,
+        file=file,
+        axes=task.scene.axes,
+    )

@@ -2,19 +2,15 @@
 
 import string
 from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
 from pydantic.dataclasses import dataclass
 
+from osel_sim.formats.catalogue import Catalogue, Entity
 from osel_sim.formats.levels import AXES
-from osel_sim.formats.task_file import ATTRIBUTE, Entity, Region, Sorting, TaskSpec
-from osel_sim.formats.terms import KINDS, PREDICATES, SKILLS, Signature, Term, TermOf
+from osel_sim.formats.terms import ATTRIBUTE, KINDS, PREDICATES, SKILLS, Signature, Term, TermOf
 from osel_sim.formats.toml_types import TABLE, FileName, Interval, OneOf, Texts, Version, between, ordered, refuse, shown, unknown_value
-
-if TYPE_CHECKING:
-    from osel_sim.formats.catalogue import Catalogue
 
 Kind = Annotated[str, OneOf(KINDS)]
 Predicate = Annotated[Term, TermOf(PREDICATES)]
@@ -22,6 +18,32 @@ Skill = Annotated[Term, TermOf(SKILLS)]
 Count = Annotated[int, between(0, 1000)]
 Faults = Iterator[tuple[tuple[str | int, ...], str]]
 """(place, problem) of each."""
+
+
+@dataclass(frozen=True, config=TABLE)
+class Region:
+    """Where things of one kind start."""
+
+    x: Interval
+    """Range away from the robot, metres; 0 is the middle of the table."""
+    y: Interval
+    """Range to the left of the robot, metres; 0 is the middle of the table."""
+    yaw: Interval = (0.0, 0.0)
+    """Range of turns, radians."""
+
+
+@dataclass(frozen=True, config=TABLE)
+class Sorting:
+    """A role filled by a rule: with `then` if the thing of role `thing` has the attribute of role `attribute`, else with `otherwise`."""
+
+    thing: str
+    """Unnamed role whose thing is looked at."""
+    attribute: str
+    """Role of kind `attribute` that names the property."""
+    then: str
+    """Role whose thing fills this one if that has the property."""
+    otherwise: str
+    """Role whose thing fills this one if it has not."""
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
@@ -73,11 +95,11 @@ class Scene:
         names: Texts = getattr(self, kind + "s")
         return names
 
-    def entities(self, catalogue: "Catalogue") -> tuple[Entity, ...]:
+    def entities(self, catalogue: Catalogue) -> tuple[Entity, ...]:
         """All its things, objects first."""
         return tuple(catalogue.things[name] for kind in KINDS for name in self.names(kind))
 
-    def faults(self, roles: Mapping[str, str], unnamed: Mapping[str, str | Sorting], catalogue: "Catalogue") -> Faults:
+    def faults(self, roles: Mapping[str, str], unnamed: Mapping[str, str | Sorting], catalogue: Catalogue) -> Faults:
         """Things that the roles need and that there are not; regions that lack, or are for nothing."""
         filled = [*roles.values(), *unnamed.values()]
         moving = {entity.kind for entity in self.entities(catalogue) if entity.joint}
@@ -177,9 +199,11 @@ class TaskFile:
     @field_validator("scene")
     @classmethod
     def _fills_the_roles(cls, scene: Scene, info: ValidationInfo) -> Scene:
-        if info.context is not None and "roles" in info.data and "unnamed" in info.data:
-            if faults := list(scene.faults(info.data["roles"], info.data["unnamed"], info.context["catalogue"])):
-                refuse(*faults)
+        roles, unnamed = info.data.get("roles"), info.data.get("unnamed")
+        if info.context is None or roles is None or unnamed is None:
+            return scene
+        if faults := list(scene.faults(roles, unnamed, info.context["catalogue"])):
+            refuse(*faults)
         return scene
 
     @field_validator("language")
@@ -197,34 +221,6 @@ class TaskFile:
             if faults := [(place, fault) for place, term, known in _terms(terms) for fault in term.faults(known, kinds)]:
                 refuse(*faults)
         return terms
-
-    def spec(self, file: Path, catalogue: "Catalogue") -> TaskSpec:
-        """The task as code wants it."""
-        entities = self.scene.entities(catalogue)
-        moving = [kind for kind in KINDS if any(entity.joint for entity in entities if entity.kind == kind)]
-        return TaskSpec(
-            name=self.name,
-            title=self.title,
-            version=self.version,
-            tags=self.tags,
-            horizon=self.horizon,
-            arena=self.scene.arena,
-            entities=entities,
-            distractors=self.scene.distractors,
-            regions={kind: self.scene.region[kind] for kind in KINDS if kind in self.scene.region},
-            starts={kind: self.scene.start.get(kind, (0.0, 0.0)) for kind in moving},
-            roles=self.roles,
-            unnamed={role: kind for role, kind in self.unnamed.items() if not isinstance(kind, Sorting)},
-            sorted_roles={role: rule for role, rule in self.unnamed.items() if isinstance(rule, Sorting)},
-            attributes=catalogue.attributes if ATTRIBUTE in self.roles.values() else {},
-            train=self.language.train,
-            held_out=self.language.held_out,
-            goal=self.goal.all,
-            subgoals=tuple(self.subgoals.items()),
-            plan=self.expert.plan,
-            file=file,
-            axes=self.scene.axes,
-        )
 
 
 def _form(value: object) -> str:

@@ -11,6 +11,8 @@ from osel_sim.formats.toml_types import shown, unknown_value
 
 KINDS = ("object", "container", "zone", "peg", "drawer", "button", "door")
 """Kinds of things. Objects lie loose; all others stand fast, some with a part that moves."""
+ATTRIBUTE = "attribute"
+"""Kind of a role that names a property (a rule such as "the red things") instead of a thing."""
 RECEPTACLES = ("container", "zone", "peg", "drawer")
 """Kinds that objects can be put into, onto or around."""
 HINGED = ("drawer", "door")

@@ -73,6 +73,8 @@ def _known(schema: Node, detail: ErrorDetails) -> tuple[str, str]:
     place, node = _walk(schema, detail["loc"])
     if kind == "fault":
         return _called(place), detail["msg"]
+    if kind == "wanted":
+        return _called(place), f"must be {detail['msg']}, got {shown(value)}"
     if kind == "value_error":
         return _called(place), str(detail["ctx"]["error"])
     if kind == "missing" and isinstance(place[-1], str):
@@ -94,7 +96,8 @@ def _wrong(schema: Node, node: Node, kind: str, value: object) -> str:
     bounded = next((option for option in _options(schema, node) if "minimum" in option), None)
     if kind in _BOUNDS and bounded is not None:
         number = float(value) if bounded["type"] == "number" else value  # type: ignore[arg-type]  # it was found to be a number
-        return f"must lie in [{bounded['minimum']}, {bounded['maximum']}], got {shown(number)}"
+        bounds = f"lie in [{bounded['minimum']}, {bounded['maximum']}]" if "maximum" in bounded else f"be {bounded['minimum']} or more"
+        return f"must {bounds}, got {shown(number)}"
     if kind == "finite_number":
         return f"must be a finite number, got {shown(value)}"
     if kind == "float_type" and isinstance(value, int) and not isinstance(value, bool):
@@ -160,11 +163,14 @@ def _child(node: Node, step: str | int) -> Node | None:
 
 def _options(schema: Node, node: Node) -> Iterator[Node]:
     """What a value may be, where there is a choice; TOML has no null."""
+    node = _resolved(schema, node)
     options = node.get("anyOf", node.get("oneOf"))
     if options is None:
         yield node
     else:
-        yield from (_resolved(schema, option) for option in options if option.get("type") != "null")
+        for option in options:
+            if option.get("type") != "null":
+                yield from _options(schema, option)
 
 
 def _resolved(schema: Node, node: Node) -> Node:

@@ -8,9 +8,8 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from osel_sim.errors import ContentError
+from osel_sim.core.errors import ContentError
 from osel_sim.formats.toml_faults import faults_of
-
 
 
 def load_toml[T](model: type[T], file: Path, context: Mapping[str, Any] | None = None) -> T:

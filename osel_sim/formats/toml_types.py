@@ -8,7 +8,7 @@ from typing import Annotated, Any, NoReturn
 from pydantic import AfterValidator, ConfigDict, Field, GetCoreSchemaHandler, StringConstraints, ValidationError, ValidationInfo
 from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, core_schema
 
-from osel_sim.errors import did_you_mean
+from osel_sim.core.errors import did_you_mean
 
 TABLE = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True, defer_build=True)
 """Configuration of every model: unknown keys are refused, numbers are finite, docstrings of attributes are the JSON Schema's descriptions."""
@@ -32,6 +32,11 @@ def between(low: float, high: float) -> Any:
     return Field(strict=True, ge=low, le=high)
 
 
+def at_least(low: int) -> Any:
+    """Annotates an integer of `low` or more."""
+    return Field(strict=True, ge=low)
+
+
 def shown(value: object) -> str:
     """A value as error messages show it: control characters escaped, at most `LONGEST` characters of it."""
     try:
@@ -49,7 +54,9 @@ def unknown_value(value: str, known: Iterable[str]) -> str:
 
 def refuse(*faults: tuple[tuple[str | int, ...], str]) -> NoReturn:
     """Raise what a validator found wrong within its value: (place within it, problem) of each fault."""
-    lines = [InitErrorDetails(type=PydanticCustomError("fault", "{problem}", {"problem": problem}), loc=place, input=None) for place, problem in faults]
+    lines = [
+        InitErrorDetails(type=PydanticCustomError("fault", "{problem}", {"problem": problem}), loc=place, input=None) for place, problem in faults
+    ]
     raise ValidationError.from_exception_data("faults", lines)
 
 

@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim import cli
-from osel_sim.context.encoder import Image
-from osel_sim.episode import Driver, episode_seed
-from osel_sim.errors import DataError, UsageError
+from osel_sim.core.errors import DataError, UsageError, did_you_mean
+from osel_sim.episodes.loop import Driver, episode_seed
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.ingestion.write import Instance, file_digest
-from osel_sim.policy.base import ACTION_DIM, STATE_DIM, Observation
+from osel_sim.interface.encoder import Image
+from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
 
 IMAGES = "observation.images."
 STATE, ACTION = "observation.state", "action"
@@ -75,7 +74,7 @@ class Dataset:
             column = settings.column(camera)
             if column not in pictures:
                 raise DataError(
-                    f"{folder}: there are no images {column!r} for the policies' camera {camera!r}: {cli.did_you_mean(column, pictures)}"
+                    f"{folder}: there are no images {column!r} for the policies' camera {camera!r}: {did_you_mean(column, pictures)}"
                     f"name one of {', '.join(pictures) or 'none'} with --camera {camera}=COLUMN"
                 )
         self.actions: NDArray[np.float32] = np.asarray(self._data.hf_dataset.with_format("numpy")[ACTION][:], np.float32)
@@ -129,7 +128,7 @@ def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings
     cameras = sorted({camera for spec in specs for camera in spec.cameras})
     for camera in settings.cameras:
         if camera not in cameras:
-            raise UsageError(f"--camera {camera}: no policy has that camera: {cli.did_you_mean(camera, cameras)}cameras: {', '.join(cameras)}")
+            raise UsageError(f"--camera {camera}: no policy has that camera: {did_you_mean(camera, cameras)}cameras: {', '.join(cameras)}")
     names = [folder.resolve().name for folder in folders]
     samples = []
     for folder, name in zip(folders, names, strict=True):
@@ -157,7 +156,7 @@ def measure(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Se
     """
     from tqdm import tqdm  # type: ignore[import-untyped]
 
-    from osel_sim.runtime.drivers import Drivers
+    from osel_sim.episodes.drivers import Drivers
 
     rows = []
     with Drivers(specs) as drivers:

@@ -1,35 +1,249 @@
-"""Reading a mapping: a TOML file, or the command line's flags as the same table."""
+"""Reading what the columns of a table mean: a mapping file, or the command line's flags as the same data."""
 
 import re
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any
 
-from osel_sim.formats.validate import Table
-from osel_sim.ingestion.mapping import (
+from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, ValidationInfo, model_validator
+from pydantic.dataclasses import dataclass
+
+from osel_sim.formats.toml_file import check, read_toml
+from osel_sim.formats.toml_types import TABLE, OneOf, Text, Texts, Version, refuse, shown
+from osel_sim.ingestion.columns import (
     COMMAND_LINE,
+    DUPLICATES,
     FIELD,
     LABELS,
     NUMBERS,
+    PLACE,
     VALUES,
-    Count,
-    Duplicates,
+    Columns,
+    Factor,
+    Files,
     Join,
-    Mapping,
     PolicyColumns,
     Success,
     Term,
+    flag,
     threshold,
 )
 
-VERSION = 1
-_PLACE = "{policy}"
-_ANY = (str, int, float, bool, list, dict)
 _OUTCOMES = ("success", "score", "subgoals")
 """What tells the policies of a table apart; what an action costs may well be the same for all."""
+Faults = Iterator[tuple[tuple[str | int, ...], str]]
+"""(place, problem) of each."""
 
 
-def load_mapping(file: Path, files: tuple[str, ...] = ()) -> Mapping:
-    """Read a mapping file.
+def _template(text: str) -> str:
+    if not text:
+        raise ValueError("must be a column, or a template with columns in braces")
+    if re.search(r"[{}]", FIELD.sub("", text)):
+        raise ValueError(f"{shown(text)} has a brace too many or too few; {{COLUMN}} stands for a column's text, other braces a text cannot have")
+    return text if FIELD.search(text) else "{" + text + "}"
+
+
+def _threshold_or_words(success: Success) -> Success:
+    if (success.at_least is None) == (not success.true) or bool(success.true) != bool(success.false) or (success.divide and success.at_least is None):
+        raise ValueError("give either at_least (with numbers), or both true and false (lists of words)")
+    if both := set(success.true) & set(success.false):
+        refuse((("true",), f"{shown(min(both))} is in false as well"))
+    return success
+
+
+def _form(value: object) -> str | None:
+    if isinstance(value, str):
+        return "column"
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return "number"
+    return "table" if isinstance(value, dict | Term | Success) else None
+
+
+def _form_or_list(value: object) -> str | None:
+    return "list" if isinstance(value, list | tuple) else _form(value)
+
+
+def _column_or_table(value: object) -> str | None:
+    return None if _form(value) == "number" else _form(value)
+
+
+_NUMBER = "a column, a number, a table with column, count, scale, divide and offset, or a list of these"
+_SUCCESS = "a column, or a table with column and at_least, or with column, true and false"
+Column = Annotated[str, Tag("column")]
+Constant = Annotated[Factor, Tag("number")]
+Part = Annotated[Column | Constant | Annotated[Term, Tag("table")], Discriminator(_form, "wanted", _NUMBER)]
+Number = Annotated[
+    Column | Constant | Annotated[Term, Tag("table")] | Annotated[tuple[Part, ...], Field(min_length=1), Tag("list")],
+    Discriminator(_form_or_list, "wanted", _NUMBER),
+]
+Succeeded = Annotated[
+    Column | Annotated[Success, AfterValidator(_threshold_or_words), Tag("table")], Discriminator(_column_or_table, "wanted", _SUCCESS)
+]
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class Source:
+    """Where the table is."""
+
+    files: Files
+    """Its files, relative to this one: names, patterns (*.csv), or templates such as `quiz_{subject}.csv`, where the braces become a column."""
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class Instance:
+    """What identifies and describes an instance."""
+
+    text: Annotated[str, AfterValidator(_template)]
+    """The instruction or question: a column, or a template with columns in braces."""
+    images: Annotated[Texts, BeforeValidator(lambda value: [value] if isinstance(value, str) else value, json_schema_input_type=str | Texts)] = ()
+    """Columns with paths of images, relative to the table that names them."""
+    group: str | None = None
+    """Column whose value is the log's task."""
+    key: str | None = None
+    """Column that identifies an instance; left out: its text, images and group do."""
+    split: str | None = None
+    """Column of the log's `split`."""
+    phrasing: str | None = None
+    """Column of the log's `phrasing`."""
+    target: str | None = None
+    """Column of the log's `target`."""
+    container: str | None = None
+    """Column of the log's `container`."""
+    duplicates: Annotated[str, OneOf(DUPLICATES)] = "refuse"
+    """What to do with a second row of the same instance (and policy, and repeat)."""
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class Values:
+    """Where an outcome is: a column, a number that holds for every row, or a table that says more."""
+
+    success: Succeeded | None = None
+    """Whether the task was done."""
+    score: Number | None = None
+    """A graded outcome, higher is better."""
+    subgoals: Number | None = None
+    """Fraction of the subgoals reached."""
+    steps: Number | None = None
+    """Steps of the robot."""
+    seconds: Number | None = None
+    """Seconds in total, where their parts are not known."""
+    upload: Number | None = None
+    """Seconds of sending the question."""
+    inference: Number | None = None
+    """Seconds of computing the answer."""
+    download: Number | None = None
+    """Seconds of sending the answer."""
+    motion: Number | None = None
+    """Seconds in which the robot moves."""
+    price: Number | None = None
+    """Cents."""
+    error: str | None = None
+    """Column that says why there is no valid outcome; empty where there is one."""
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class Outcome(Values):
+    """What holds for every policy; {policy} stands for its name."""
+
+    policy: str | None = None
+    """Column of policies, in a long table: one with a row for each instance and policy."""
+    repeat: str | None = None
+    """Column that numbers repeats from 0 on."""
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class Policy(Values):
+    """What holds for one policy."""
+
+    name: str | None = None
+    """What it is called in the log; left out: as in the table."""
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class ColumnsFile:
+    """What the columns of an outcome table mean, for `python -m osel_sim.ingest --map FILE`."""
+
+    version: Version
+    """Of the format."""
+    name: Text
+    """Of the workload; the task of instances without a group."""
+    table: Source
+    """Where the table is."""
+    join: tuple[Join, ...] = ()
+    """Other tables whose columns come beside."""
+    instance: Instance
+    """What identifies and describes an instance."""
+    outcome: Outcome = Field(default_factory=Outcome)
+    """What holds for every policy."""
+    policies: dict[str, Policy] = Field(default_factory=dict)
+    """Each policy by its name in the table, and what holds for it only."""
+
+    @model_validator(mode="after")
+    def _fits_together(self, info: ValidationInfo) -> "ColumnsFile":
+        context = info.context or {}
+        if faults := [*self._lacking(context.get("file") == COMMAND_LINE), *self._unequal(), *self._shared(context)]:
+            refuse(*faults)
+        return self
+
+    def values(self, policy: Policy) -> dict[str, Any]:
+        """What is said of a policy, by the names of `VALUES`."""
+        both = {key: own if (own := getattr(policy, key)) is not None else getattr(self.outcome, key) for key in VALUES}
+        return {key: value for key, value in both.items() if value is not None}
+
+    def _lacking(self, from_flags: bool) -> Faults:
+        """Values that lack, or are there twice."""
+        if self.outcome.policy is not None and self.instance.duplicates == "keep":
+            yield ("instance", "duplicates"), 'must be "refuse", "drop" or "repeats" in a long table, where many rows are about one instance'
+        if not self.policies and self.outcome.policy is None:
+            needs = "a wide table needs [policies.NAME] for each policy, a long one outcome.policy, its column of policies"
+            yield ("policies", "NAME"), f"is missing: {needs}"
+            return
+        places: dict[tuple[str, ...], Policy] = {("policies", name): policy for name, policy in self.policies.items()} or {("outcome",): Policy()}
+        values = {place: self.values(policy) for place, policy in places.items()}
+        for place, given in values.items():
+            if "success" not in given:
+                yield (*place, "success"), f"is missing; {threshold(from_flags)} takes a score from so much on as success"
+                return  # of all others that lack it the same would be said
+        for place, given in values.items():
+            clash = [key for key in ("upload", "inference", "download", "motion") if key in given]
+            if clash and "seconds" in given:
+                yield (*place, "seconds"), f"is the total, where its parts are not known; {clash[0]} is given as well"
+
+    def _unequal(self) -> Faults:
+        """What is known of one policy must be known of all: nothing is free, or takes no time, because a line is missing."""
+        for number in NUMBERS:
+            keys = (number, "seconds") if number == "inference" else (number,)
+            given = {name: next((key for key in keys if key in self.values(policy)), None) for name, policy in self.policies.items()}
+            having = next((name for name in given if given[name] is not None), None)
+            for name, key in given.items():
+                if having is not None and key is None:
+                    first = self.policies[having].name or having
+                    problem = f"is missing, policy {first!r} has it; give it for all (0 where it is free or takes no time)"
+                    yield ("policies", name, str(given[having])), problem
+
+    def _shared(self, context: dict[str, Any]) -> Faults:
+        """Names of two policies, and outcomes of one that several would have."""
+        titles = [policy.name or name for name, policy in self.policies.items()]
+        for title in dict.fromkeys(titles):
+            if titles.count(title) > 1:
+                yield ("policies", title), "is the name of two policies"
+        if self.outcome.policy is not None:
+            return
+        way = "--policy-column" if context.get("file") == COMMAND_LINE else "outcome.policy"
+        for key in _OUTCOMES:
+            heirs = [name for name, policy in self.policies.items() if getattr(policy, key) is None]
+            value = context.get("data", {}).get("outcome", {}).get(key)
+            if len(heirs) > 1 and isinstance(value, str | list | dict) and PLACE not in str(value):
+                yield (
+                    ("outcome", key),
+                    f"is {shown(value)} for each of {', '.join(heirs)}; let {PLACE} in it stand for the policy's name, or give each policy its own; "
+                    f"if the table is long, name its column of policies ({way})",
+                )
+
+
+def load_columns(file: Path, files: tuple[str, ...] = ()) -> Columns:
+    """Read a file.
 
     Args:
         files: where given, in place of `table.files`, and relative to the working folder.
@@ -37,207 +251,65 @@ def load_mapping(file: Path, files: tuple[str, ...] = ()) -> Mapping:
     Raises:
         ContentError: naming the file, the key and what would be right.
     """
-    table = Table.load(file)
-    return parse_mapping(table, file.parent, tuple(str(Path(name).absolute()) for name in files))
+    data = read_toml(file)
+    if files and isinstance(table := data.get("table", {}), dict):
+        data["table"] = table | {"files": [str(Path(name).absolute()) for name in files]}
+    return parse_columns(data, file, file.parent)
 
 
-def parse_mapping(table: Table, base: Path, files: tuple[str, ...] = ()) -> Mapping:
-    """Check a mapping's table.
+def parse_columns(data: dict[str, Any], file: Path | str, base: Path) -> Columns:
+    """Check the data of a file, or of flags.
 
     Args:
-        base: folder that its files are relative to.
-        files: in place of `table.files`.
+        file: the file, or `COMMAND_LINE`: errors then name flags.
+        base: folder that the table's files are relative to.
 
     Raises:
         ContentError: naming the key and what would be right.
     """
-    table.integer("version", VERSION, VERSION)
-    name = table.get("name", str)
-    if not name:
-        raise table.error("name", "must not be empty")
-    source = table.table("table", {} if files else ...)
-    own = source.strings("files", ()) if files else _files(source)
-    source.done()
-    joins = tuple(_join(table, index, entry) for index, entry in enumerate(table.get("join", list, [])))
-    instance = table.table("instance")
-    text = instance.get("text", str)
-    if not text:
-        raise instance.error("text", "must be a column, or a template with columns in braces")
-    if re.search(r"[{}]", FIELD.sub("", text)):
-        raise instance.error(
-            "text", f"{text!r} has a brace too many or too few; {{COLUMN}} stands for a column's text, other braces a text cannot have"
-        )
-    if not FIELD.search(text):
-        text = "{" + text + "}"
-    labels = {label: instance.get(label, str) for label in LABELS if label in instance.data}
-    images = instance.get("images", (str, list), [])
-    images = (images,) if isinstance(images, str) else instance.strings("images", [])
-    outcome = table.table("outcome", {})
-    policy = outcome.get("policy", str, None)
-    policies, default = _policies(table.table("policies", {}), outcome, policy)
-    mapping = Mapping(
-        file=table.file,
+    found = check(ColumnsFile, data, file, called=flag if file == COMMAND_LINE else str)
+    instance, outcome = found.instance, found.outcome
+    return Columns(
+        file=file,
         base=base,
-        name=name,
-        files=files or own,
-        joins=joins,
-        text=text,
-        images=images,
-        group=instance.get("group", str, None),
-        key=instance.get("key", str, None),
-        labels=labels,
-        duplicates=_literal(instance, "duplicates", get_args(Duplicates), "refuse"),
-        policy=policy,
-        repeat=outcome.get("repeat", str, None),
-        policies=policies,
-        default=default,
+        name=found.name,
+        files=found.table.files,
+        joins=found.join,
+        text=instance.text,
+        images=instance.images,
+        group=instance.group,
+        key=instance.key,
+        labels={label: column for label in LABELS if (column := getattr(instance, label)) is not None},
+        duplicates=instance.duplicates,
+        policy=outcome.policy,
+        repeat=outcome.repeat,
+        policies={name: _policy(found.values(policy), name, policy.name or name) for name, policy in found.policies.items()},
+        default=None if found.policies else _policy(found.values(Policy()), PLACE, ""),
     )
-    if policy is not None and mapping.duplicates == "keep":
-        raise instance.error("duplicates", 'must be "refuse", "drop" or "repeats" in a long table, where many rows are about one instance')
-    for part in (instance, outcome, table):
-        part.done()
-    return mapping
 
 
-def _join(table: Table, index: int, entry: Any) -> Join:
-    if not isinstance(entry, dict):
-        raise table.error("join", f"must be a list of tables, got {entry!r}")
-    part = Table(entry, table.file, f"join[{index}].")
-    join = Join(_files(part), part.get("on", str))
-    part.done()
-    return join
+def _policy(values: dict[str, Any], name: str, title: str) -> PolicyColumns:
+    """Where the outcome of a policy is.
+
+    Args:
+        name: the table's.
+        title: the log's.
+    """
+    success = Success(values["success"]) if isinstance(values["success"], str) else values["success"]
+    numbers = {key: _terms(values[key], name) for key in NUMBERS if key in values}
+    if "seconds" in values:
+        numbers["inference"] = _terms(values["seconds"], name)
+    error = values.get("error")
+    return PolicyColumns(title, _named(success, name), numbers, None if error is None else error.replace(PLACE, name), "seconds" in values)
 
 
-def _files(table: Table) -> tuple[str, ...]:
-    files = table.strings("files")
-    if not files:
-        raise table.error("files", "must name at least one file")
-    return files
+def _terms(value: str | float | Term | tuple[str | float | Term, ...], name: str) -> tuple[Term | float, ...]:
+    parts = value if isinstance(value, tuple) else (value,)
+    terms = (Term(part) if isinstance(part, str) else part for part in parts)
+    return tuple(_named(term, name) if isinstance(term, Term) else term for term in terms)
 
 
-def _policies(section: Table, outcome: Table, column: str | None) -> tuple[dict[str, PolicyColumns], PolicyColumns | None]:
-    """Columns of each policy, and of those that are not named."""
-    common = {key: outcome.get(key, _ANY, None) for key in VALUES if key in outcome.data}
-    policies: dict[str, PolicyColumns] = {}
-    for name in section.data:
-        part = section.table(name)
-        own = {key: part.get(key, _ANY) for key in VALUES if key in part.data}
-        title = part.get("name", str, name)
-        merged = type(section)({**common, **own}, section.file, part.prefix)
-        policies[name] = _columns(merged, name, title)
-        part.done()
-    if column is None:
-        _own_outcomes(section, outcome, common)
-    titles = [policy.name for policy in policies.values()]
-    for title in titles:
-        if titles.count(title) > 1:
-            raise section.error(title, "is the name of two policies")
-    default = None
-    if not policies:
-        if column is None:
-            raise section.error(
-                "NAME",
-                "is missing: a wide table needs [policies.NAME] for each policy, a long one outcome.policy, its column of policies",
-            )
-        default = _columns(type(section)(common, section.file, outcome.prefix), _PLACE, "")
-    _same_measures(section, policies)
-    return policies, default
-
-
-def _own_outcomes(section: Table, outcome: Table, common: dict[str, Any]) -> None:
-    """What a wide table says for all policies must not give several of them the outcome of one."""
-    for key in _OUTCOMES:
-        value = common.get(key)
-        heirs = [name for name in section.data if key not in section.data[name]]
-        if len(heirs) > 1 and isinstance(value, str | list | dict) and _PLACE not in str(value):
-            way = "--policy-column" if _from_flags(outcome) else "outcome.policy"
-            raise outcome.error(
-                key,
-                f"is {value!r} for each of {', '.join(heirs)}; let {_PLACE} in it stand for the policy's name, or give each policy its own; "
-                f"if the table is long, name its column of policies ({way})",
-            )
-
-
-def _same_measures(section: Table, policies: dict[str, PolicyColumns]) -> None:
-    """What is known of one policy must be known of all: nothing is free, or takes no time, because a line is missing."""
-    for first in policies.values():
-        for name, policy in policies.items():
-            lacking = [number for number in first.numbers if number not in policy.numbers]
-            if lacking:
-                raise section.error(
-                    f"{name}.{first.called(lacking[0])}",
-                    f"is missing, policy {first.name!r} has it; give it for all (0 where it is free or takes no time)",
-                )
-
-
-def _columns(table: Table, name: str, title: str) -> PolicyColumns:
-    if "success" not in table.data:
-        raise table.error("success", f"is missing; {threshold(_from_flags(table))} takes a score from so much on as success")
-    success = _success(table, name)
-    numbers: dict[str, tuple[Term, ...]] = {}
-    for key in NUMBERS:
-        if key in table.data:
-            numbers[key] = _terms(table, key, name)
-    if "seconds" in table.data:
-        clash = [key for key in ("upload", "inference", "download", "motion") if key in numbers]
-        if clash:
-            raise table.error("seconds", f"is the total, where its parts are not known; {clash[0]} is given as well")
-        numbers["inference"] = _terms(table, "seconds", name)
-    error = table.get("error", str, None)
-    return PolicyColumns(title, success, numbers, None if error is None else error.replace(_PLACE, name), "seconds" in table.data)
-
-
-def _success(table: Table, name: str) -> Success:
-    value = table.get("success", _ANY)
-    if isinstance(value, str):
-        return Success(value.replace(_PLACE, name))
-    if not isinstance(value, dict):
-        raise table.error("success", f"must be a column, or a table with column and at_least, or with column, true and false; got {value!r}")
-    part = table.table("success")
-    at_least = part.number("at_least", -1e12, 1e12) if "at_least" in part.data else None
-    divide = part.get("divide", str, None)
-    true, false = part.strings("true", ()), part.strings("false", ())
-    if (at_least is None) == (not true) or bool(true) != bool(false) or (divide is not None and at_least is None):
-        raise table.error("success", "give either at_least (with numbers), or both true and false (lists of words)")
-    both = set(true) & set(false)
-    if both:
-        raise part.error("true", f"{min(both)!r} is in false as well")
-    success = Success(part.get("column", str).replace(_PLACE, name), at_least, divide and divide.replace(_PLACE, name), true, false)
-    part.done()
-    return success
-
-
-def _terms(table: Table, key: str, name: str) -> tuple[Term, ...]:
-    value = table.get(key, _ANY)
-    entries = value if isinstance(value, list) else [value]
-    if not entries:
-        raise table.error(key, "must not be an empty list")
-    return tuple(_term(table, key, entry, name) for entry in entries)
-
-
-def _term(table: Table, key: str, value: Any, name: str) -> Term:
-    if isinstance(value, str):
-        return Term(value.replace(_PLACE, name))
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        return Term(offset=type(table)({key: value}, table.file, table.prefix).number(key, -1e12, 1e12))
-    if not isinstance(value, dict):
-        raise table.error(key, f"must be a column, a number, a table with column, count, scale, divide and offset, or a list of these; got {value!r}")
-    part = Table(value, table.file, f"{table.prefix}{key}.")
-    divide = part.get("divide", str, None)
-    term = Term(
-        column=part.get("column", str).replace(_PLACE, name),
-        count=_literal(part, "count", get_args(Count), "value"),
-        scale=part.number("scale", -1e12, 1e12, 1.0),
-        divide=None if divide is None else divide.replace(_PLACE, name),
-        offset=part.number("offset", -1e12, 1e12, 0.0),
-    )
-    part.done()
-    return term
-
-
-def _from_flags(table: Table) -> bool:
-    return table.file == COMMAND_LINE
-
-
-def _literal(table: Table, key: str, known: tuple[Any, ...], default: str) -> Any:
-    return table.choice(key, known, default)
+def _named[T: (Term, Success)](value: T, name: str) -> T:
+    """The same with a policy's name in its columns' names."""
+    divide = None if value.divide is None else value.divide.replace(PLACE, name)
+    return replace(value, column=value.column.replace(PLACE, name), divide=divide)

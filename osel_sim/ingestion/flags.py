@@ -1,29 +1,14 @@
-"""The command line's flags as what a mapping file would hold; what is wrong with it names the flag."""
+"""The command line's flags as the data that a mapping file would hold."""
 
 import argparse
 from typing import Any
 
-from osel_sim import cli
-from osel_sim.errors import ContentError, UsageError
-from osel_sim.formats.validate import Table
-from osel_sim.ingestion.mapping import COMMAND_LINE, VALUES, flag
+from osel_sim.core.errors import UsageError, did_you_mean
+from osel_sim.ingestion.columns import VALUES
 
 
-class FlagTable(Table):
-    """A mapping's table that was made of flags: errors name the flag where those of a file name the key."""
-
-    def error(self, key: str, problem: str) -> ContentError:
-        """An error about one flag, to be raised."""
-        return ContentError(self.file, flag(self.prefix + key), problem)
-
-    def table(self, key: str, default: Any = ...) -> Table:
-        """A table within this one."""
-        part = super().table(key, default)
-        return FlagTable(part.data, part.file, part.prefix)
-
-
-def as_table(options: argparse.Namespace, files: tuple[str, ...]) -> FlagTable:
-    """A mapping's table.
+def as_data(options: argparse.Namespace, files: tuple[str, ...]) -> dict[str, Any]:
+    """What a mapping file would hold.
 
     Args:
         options: the flags of `osel_sim.ingest`.
@@ -47,12 +32,12 @@ def as_table(options: argparse.Namespace, files: tuple[str, ...]) -> FlagTable:
             if equals and policy in policies:
                 policies[policy][key] = _value(key, value, options.at_least)
             elif equals and names:
-                raise UsageError(f"--{key} {item}: unknown policy {policy!r}: {cli.did_you_mean(policy, names)}known: {', '.join(names)}")
+                raise UsageError(f"--{key} {item}: unknown policy {policy!r}: {did_you_mean(policy, names)}known: {', '.join(names)}")
             elif key in outcome:
                 raise UsageError(f"--{key}: {item!r} is the second value for all policies; write POLICY=VALUE, with the policies after --policies")
             else:
                 outcome[key] = _value(key, item, options.at_least)
-    data = {
+    return {
         "version": 1,
         "name": options.name or options.out.resolve().name,
         "table": {"files": list(files)},
@@ -60,7 +45,6 @@ def as_table(options: argparse.Namespace, files: tuple[str, ...]) -> FlagTable:
         "outcome": {key: value for key, value in outcome.items() if value is not None},
         "policies": policies,
     }
-    return FlagTable(data, COMMAND_LINE)
 
 
 def _value(key: str, text: str, at_least: float | None) -> Any:

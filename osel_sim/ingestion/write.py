@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from osel_sim.context.encoder import Encoder, Image
-from osel_sim.errors import DataError, UsageError
+from osel_sim.core.errors import DataError, UsageError
+from osel_sim.core.files import read_json, write_json
 from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
-from osel_sim.formats.run_config import read_json, write_json
+from osel_sim.interface.encoder import Encoder, Image
 
 INGEST = "ingest.json"
 AUTOSAVE = 500

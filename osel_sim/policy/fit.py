@@ -9,10 +9,10 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from osel_sim.errors import CheckpointError
+from osel_sim.core.errors import CheckpointError
 from osel_sim.formats.conventions import ENVIRONMENT_STATES, STATE_PARTS, Conventions
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.policy.base import ACTION_DIM
+from osel_sim.interface.policy import ACTION_DIM
 
 PREPROCESSOR = "policy_preprocessor.json"
 

@@ -19,17 +19,17 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor
 
-from osel_sim import content
-from osel_sim.errors import CheckpointError
+from osel_sim.core import content
+from osel_sim.core.errors import CheckpointError
+from osel_sim.core.hub import offline_if_unreachable
+from osel_sim.core.torch_settings import threads
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.hub import offline_if_unreachable
+from osel_sim.interface.policy import Actions, Observation, Policy
 from osel_sim.policy import register
-from osel_sim.policy.base import Actions, Observation, Policy
 from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors
 from osel_sim.policy.mapping import actions_of, state_of
 from osel_sim.policy.perception_step import PerceptionStep
 from osel_sim.policy.text import embed
-from osel_sim.threads import threads
 
 
 def load(spec: PolicySpec) -> Callable[[], Policy]:

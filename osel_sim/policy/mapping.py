@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import PolicyError
+from osel_sim.core.errors import PolicyError
 from osel_sim.formats.conventions import Conventions
-from osel_sim.policy.base import ACTION_DIM, Observation
+from osel_sim.interface.policy import ACTION_DIM, Observation
 
 STATE = "observation.state"
 OPEN_FINGER = 0.04

@@ -7,9 +7,9 @@ own state, which may share the weights. Others add a kind through the entry-poin
 from collections.abc import Callable
 from importlib.metadata import EntryPoint, entry_points
 
-from osel_sim.errors import UnknownNameError, UsageError
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats.policy_file import PRIVILEGED, PolicySpec
-from osel_sim.policy.base import Policy
+from osel_sim.interface.policy import Policy
 
 MakeSession = Callable[[], Policy]
 Loader = Callable[[PolicySpec], MakeSession]

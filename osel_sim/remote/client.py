@@ -12,10 +12,10 @@ from urllib.parse import urlsplit
 from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from osel_sim.errors import PolicyError, RemoteError
+from osel_sim.core.errors import PolicyError, RemoteError
 from osel_sim.formats.conventions import Conventions
-from osel_sim.policy.base import Actions, Observation
-from osel_sim.policy.call import check_actions
+from osel_sim.interface.policy import Actions, Observation
+from osel_sim.policy.local import check_actions
 from osel_sim.policy.mapping import actions_of, message_of
 from osel_sim.remote.codec import ProtocolError, pack, unpack
 from osel_sim.remote.protocol import IMAGES, RESET, Greeting

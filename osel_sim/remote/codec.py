@@ -11,7 +11,7 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped,unused-ignore]
 import numpy as np
 
-from osel_sim.errors import RemoteError
+from osel_sim.core.errors import RemoteError
 
 DTYPES = frozenset({"|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"})
 MAX_DIMENSIONS = 8

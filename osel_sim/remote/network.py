@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from osel_sim.errors import UnknownNameError
+from osel_sim.core.errors import UnknownNameError
 from osel_sim.formats.policy_file import NETWORKS
 
 MINIMUM_RETRANSMISSION = 0.2  # seconds added to the round trip before TCP sends again (Linux' TCP_RTO_MIN; RFC 6298 has 1 s)

@@ -4,10 +4,10 @@ import contextlib
 import os
 import time
 
-from osel_sim.errors import RemoteError, UsageError
+from osel_sim.core.errors import RemoteError, UsageError
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.policy.base import Observation
-from osel_sim.policy.call import Call
+from osel_sim.interface.call import Call
+from osel_sim.interface.policy import Observation
 from osel_sim.policy.mapping import message_of
 from osel_sim.remote.client import Answer, RemoteClient
 from osel_sim.remote.network import Delays, NetworkModel, NetworkProfile, profile

@@ -11,7 +11,7 @@ import tempfile
 import threading
 from typing import IO, Self
 
-from osel_sim.errors import RemoteError
+from osel_sim.core.errors import RemoteError
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from osel_sim.errors import OselError, UsageError
+from osel_sim.core.errors import OselError, UsageError
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.policy.base import ACTION_DIM, STATE_DIM, Observation
+from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
 from osel_sim.remote.codec import ProtocolError
 
 PROTOCOL = "osel_sim/1"

@@ -15,9 +15,9 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from osel_sim.errors import OselError, PolicyError, RemoteError
-from osel_sim.policy.base import Policy
-from osel_sim.policy.call import check_actions
+from osel_sim.core.errors import OselError, PolicyError, RemoteError
+from osel_sim.interface.policy import Policy
+from osel_sim.policy.local import check_actions
 from osel_sim.policy.registry import MakeSession
 from osel_sim.remote.codec import ProtocolError, pack, unpack
 from osel_sim.remote.protocol import (

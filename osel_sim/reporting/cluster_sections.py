@@ -7,14 +7,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.offline.clusters import Cluster, Clustering, Inequality, describe, find_clusters, inequality
-from osel_sim.offline.estimate import mean_of
-from osel_sim.offline.frontier import frontiers, measured
-from osel_sim.offline.log import Array, LoggedOutcomes, mean_over_repeats
-from osel_sim.offline.weights_map import Axis, TrivialRange, trivial_ranges, weights_map
+from osel_sim.analysis.clusters import Cluster, Clustering, Inequality, describe, find_clusters, inequality
+from osel_sim.analysis.estimate import mean_of
+from osel_sim.analysis.frontier import frontiers, measured
+from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
+from osel_sim.analysis.weights_map import Axis, TrivialRange, trivial_ranges, weights_map
 from osel_sim.reporting.description import Bars, Cell, Column, Figure, Heat, Line, Mark, Panel, Points, Table, colours
+from osel_sim.reporting.html_tables import to_text
 from osel_sim.reporting.log_sections import score_label
-from osel_sim.reporting.tables import to_text
 from osel_sim.selection.reward import PRESETS, RewardWeights
 
 WHY_DIFFERENT = (
@@ -28,8 +28,8 @@ class Replayed:
     """What the frontier shows of selectors.
 
     Attributes:
-        points: of each at the weights given, as `osel_sim.offline.frontier.measured` names it.
-        swept: what they came to at others, as `osel_sim.offline.frontier.selector_frontiers` gives it; None where that was not replayed.
+        points: of each at the weights given, as `osel_sim.analysis.frontier.measured` names it.
+        swept: what they came to at others, as `osel_sim.analysis.frontier.selector_frontiers` gives it; None where that was not replayed.
         colour: of each.
         shown: those drawn without being asked for.
     """

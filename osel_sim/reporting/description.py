@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from osel_sim.errors import UsageError
-from osel_sim.offline.estimate import Estimate
+from osel_sim.analysis.estimate import Estimate
+from osel_sim.core.errors import UsageError
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.offline.log import Array, LoggedOutcomes
+from osel_sim.analysis.log import Array, LoggedOutcomes
 from osel_sim.reporting.description import digits_of, shortened
 from osel_sim.reporting.page import Episodes
 from osel_sim.selection.reward import RewardWeights

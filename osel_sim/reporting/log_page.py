@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from osel_sim.errors import DataError
+from osel_sim.analysis.clusters import complete_instances
+from osel_sim.analysis.estimate import Estimate
+from osel_sim.analysis.log import LoggedOutcomes
+from osel_sim.analysis.outcomes import remote_policies
+from osel_sim.core.errors import DataError
 from osel_sim.formats.rollout_log import read_rollouts
-from osel_sim.offline.clusters import complete_instances
-from osel_sim.offline.estimate import Estimate
-from osel_sim.offline.log import LoggedOutcomes
-from osel_sim.offline.outcomes import remote_policies
 from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, cluster_blocks, frontier_figure, weights_blocks
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_sections import context_figure, formula, policy_blocks, rates_table, time_figure

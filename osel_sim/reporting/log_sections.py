@@ -7,10 +7,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.offline.contexts import lay_out
-from osel_sim.offline.estimate import Estimate
-from osel_sim.offline.log import Array, LoggedOutcomes
-from osel_sim.offline.outcomes import EVERYTHING, PolicyResult, outcome_rates, per_group
+from osel_sim.analysis.contexts import lay_out
+from osel_sim.analysis.estimate import Estimate
+from osel_sim.analysis.log import Array, LoggedOutcomes
+from osel_sim.analysis.outcomes import EVERYTHING, PolicyResult, outcome_rates, per_group
 from osel_sim.reporting.description import Bars, Column, Figure, Line, Mark, Panel, Points, Table, colours, shortened
 from osel_sim.reporting.episodes import graded
 from osel_sim.selection.reward import RewardWeights

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from osel_sim.offline.estimate import Estimate
+from osel_sim.analysis.estimate import Estimate
 from osel_sim.reporting.description import Cell, Column, Table
 
 
@@ -11,7 +11,7 @@ def off_policy_table(found: Mapping[str, Any]) -> Table:
     """What other ways of choosing would have earned in a live run.
 
     Args:
-        found: as `osel_sim.offline.evaluation.evaluate` returns it.
+        found: as `osel_sim.analysis.evaluation.evaluate` returns it.
     """
     run = found["run"]
     received: dict[str, Cell] = dict.fromkeys(("ips", "snips"))

@@ -8,9 +8,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 from osel_sim.reporting.description import DARK, LIGHT, Figure, Table
-from osel_sim.reporting.tables import to_csv, to_text
+from osel_sim.reporting.html_tables import to_csv, to_text
 
 PAGE, FIGURES, TABLES = "report.html", "figures", "tables"
 ROW_HEIGHT = 22

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from osel_sim.errors import DataError, UsageError
+from osel_sim.analysis.clusters import score_of
+from osel_sim.analysis.frontier import measured
+from osel_sim.analysis.live import is_live_run, read_live
+from osel_sim.analysis.log import Array, LoggedOutcomes, read_log
+from osel_sim.analysis.measures import curves
+from osel_sim.analysis.oracles import oracles
+from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.replay_result import REPLAY, Choices, read_replay
 from osel_sim.formats.rollout_log import read_rollouts
-from osel_sim.offline.clusters import score_of
-from osel_sim.offline.frontier import measured
-from osel_sim.offline.live import is_live_run, read_live
-from osel_sim.offline.log import Array, LoggedOutcomes, read_log
-from osel_sim.offline.measures import curves
-from osel_sim.offline.oracles import oracles
 from osel_sim.reporting.cluster_sections import Replayed
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_page import bounds, few, log_facts, log_sections, signed

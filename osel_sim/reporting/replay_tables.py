@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from osel_sim.offline.estimate import Estimate
+from osel_sim.analysis.estimate import Estimate
 from osel_sim.reporting.description import Cell, Column, Table
 from osel_sim.reporting.selector_sections import ORACLES
 

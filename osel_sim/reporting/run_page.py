@@ -8,24 +8,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import DataError
+from osel_sim.analysis.clusters import score_of
+from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
+from osel_sim.analysis.evaluation import evaluate
+from osel_sim.analysis.live import JOURNAL, LiveLog, read_live
+from osel_sim.analysis.log import Array, LoggedOutcomes
+from osel_sim.core.errors import DataError
+from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, read_journal
-from osel_sim.formats.run_config import RUN, read_json
-from osel_sim.offline.clusters import score_of
-from osel_sim.offline.estimate import Estimate, mean_of, rate_of
-from osel_sim.offline.evaluation import evaluate
-from osel_sim.offline.live import JOURNAL, LiveLog, read_live
-from osel_sim.offline.log import Array, LoggedOutcomes
-from osel_sim.offline.sequential import advantage_bounds
+from osel_sim.formats.run_config import RUN
 from osel_sim.reporting.description import Cell, Column, Figure, Line, Mark, Panel, Table, colours, thinned
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes
+from osel_sim.reporting.html_tables import to_text
 from osel_sim.reporting.log_page import few, interval, log_sections, signed
 from osel_sim.reporting.log_sections import formula
 from osel_sim.reporting.off_policy_section import off_policy_table
 from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
 from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, penalty_figure, regret_figure, share_figure, style_of
-from osel_sim.reporting.tables import to_text
 from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
+from osel_sim.statistics.betting import advantage_bounds
 
 VIDEOS = "videos"
 HINDSIGHT = ORACLES["hindsight"]

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from osel_sim import content
-from osel_sim.errors import DataError
-from osel_sim.offline.log import LoggedOutcomes
+from osel_sim.analysis.log import LoggedOutcomes
+from osel_sim.core import content
+from osel_sim.core.errors import DataError
 from osel_sim.reporting.episodes import jpeg
 
 CAMERA, SIZE = "agentview", 240

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.offline.estimate import Estimate, mean_of, rate_of
-from osel_sim.offline.log import Array
+from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
+from osel_sim.analysis.log import Array
 from osel_sim.reporting.description import Bars, Figure, Line, Mark, Panel, Points, colours, thinned
 from osel_sim.reporting.log_sections import score_label
 from osel_sim.selection.reward import RewardWeights

@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import ndtr
 
-from osel_sim.errors import UnknownNameError, UsageError
+from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.interface.selector import Choice, Context, State
+from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.features import Array, Features, Sketch
-from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
 
 INTERCEPT = 0.5
@@ -54,7 +55,7 @@ class BayesianSelector(SelectorBase):
         signals: candidates for the prior variance of w relative to the noise, > 0.
         optimism, chance: see above, >= 0.
         expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
-            learned (`osel_sim.costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
+            learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
         skills: what policies are said to be able to do, as a first guess of their success; None: nothing is said.
         warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
 

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from numpy.typing import ArrayLike, NDArray
 
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 
 Round = tuple[NDArray[np.float32], Callable[[int], float]]
 """A context, float32 (context_dim,), and the reward of choosing policy i for it. Only the chosen one is ever called."""

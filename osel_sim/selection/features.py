@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from osel_sim.selection.protocol import State
+from osel_sim.interface.selector import State
 
 Array = NDArray[np.float64]
 

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from osel_sim.errors import UnknownNameError
-from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+from osel_sim.core.errors import UnknownNameError
+from osel_sim.interface.selector import Choice, Context, State
+from osel_sim.selection.base import SelectorBase
 
 
 class FixedSelector(SelectorBase):

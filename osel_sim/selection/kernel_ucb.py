@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from numpy.typing import ArrayLike
 
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 from osel_sim.selection.bayesian import BayesianSelector
 from osel_sim.selection.features import Landmarks
 from osel_sim.selection.skills import Skills
@@ -21,8 +21,8 @@ class KernelUCBSelector(BayesianSelector):
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
-        expected_costs: policy -> declared alpha_time * time + alpha_price * price, as `osel_sim.costs.expected_costs` gives; None learns them too.
-        skills: which policies declare what, as `osel_sim.skills.declare` gives it; a first guess, overruled by outcomes. None: nothing is known.
+        expected_costs: policy -> declared alpha_time * time + alpha_price * price, as `episodes.expected_costs` gives; None learns them too.
+        skills: which policies declare what, as `episodes.declared_skills` gives it; a first guess, overruled by outcomes. None: nothing is known.
         warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
         components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
         signals, optimism, chance: see `BayesianSelector`. A little chance keeps every propensity above 0 where policies are close.

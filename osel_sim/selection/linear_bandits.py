@@ -5,7 +5,7 @@ from typing import Any, ClassVar
 
 from numpy.typing import ArrayLike
 
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 from osel_sim.selection.bayesian import BayesianSelector
 from osel_sim.selection.features import Components
 

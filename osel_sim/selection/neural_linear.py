@@ -6,10 +6,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
+from osel_sim.interface.selector import State
 from osel_sim.selection.bayesian import BayesianSelector
 from osel_sim.selection.features import Array, Components
-from osel_sim.selection.protocol import State
 
 STEPS, RATE, DECAY = 150, 0.02, 1e-3
 """Of the network's training: steps on all decisions at once, Adam's learning rate, weight decay."""

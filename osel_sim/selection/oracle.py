@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
-from osel_sim.selection.protocol import State
+from osel_sim.interface.selector import State
 
 
 class RandomStreams:

@@ -6,8 +6,8 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Any, cast
 
-from osel_sim.errors import UnknownNameError, UsageError
-from osel_sim.selection.protocol import Selector
+from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.interface.selector import Selector
 
 ENTRY_POINTS = "osel_sim.selectors"
 """Entry-point group in which other packages offer selectors: `name = "module:Class"`."""
@@ -20,8 +20,8 @@ BUILT_IN = {
     "lints": "osel_sim.selection.linear_bandits:LinTSSelector",
     "linucb": "osel_sim.selection.linear_bandits:LinUCBSelector",
     "neural_linear": "osel_sim.selection.neural_linear:NeuralLinearSelector",
-    "ppo": "osel_sim.selection.ppo:PPOSelector",
-    "ppo_tuned": "osel_sim.selection.ppo_tuned:TunedPPOSelector",
+    "ppo": "osel_sim.selection.ppo.sb3:PPOSelector",
+    "ppo_tuned": "osel_sim.selection.ppo.tuned:TunedPPOSelector",
     "random": "osel_sim.selection.uniform:UniformSelector",
     "thompson": "osel_sim.selection.thompson:ThompsonSelector",
     "ucb1": "osel_sim.selection.ucb1:UCB1Selector",

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from osel_sim.errors import UnknownNameError, UsageError
-from osel_sim.formats.outcome import Outcome, Seconds
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import Row
+from osel_sim.interface.outcome import Outcome, Seconds
 
 TimeUnit = Literal["log10-seconds", "steps"]
 Success = Literal["success", "subgoals", "score"]

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.interface.selector import Context, State
 from osel_sim.selection.features import Components, Sketch
-from osel_sim.selection.protocol import Context, State
 
 FIRST, LAST = 16, 2048
 """Components are fitted when so many contexts have been seen, whenever their number has doubled since, and for the last time at the second number."""

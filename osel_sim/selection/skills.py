@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import UsageError
-from osel_sim.selection.protocol import Context
+from osel_sim.core.errors import UsageError
+from osel_sim.interface.selector import Context
 
 Array = NDArray[np.float64]
 

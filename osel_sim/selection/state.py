@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from osel_sim.errors import DataError
-from osel_sim.selection.protocol import State
+from osel_sim.core.errors import DataError
+from osel_sim.interface.selector import State
 
 FORMAT = "osel_sim.selector_state.v1"
 

@@ -6,7 +6,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+from osel_sim.interface.selector import Choice, Context, State
+from osel_sim.selection.base import SelectorBase
 
 NODES = 512
 """Points of each policy's belief at which the probability that it is the best is evaluated."""

@@ -5,8 +5,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from osel_sim.errors import UsageError
-from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+from osel_sim.core.errors import UsageError
+from osel_sim.interface.selector import Choice, Context, State
+from osel_sim.selection.base import SelectorBase
 
 
 class UCB1Selector(SelectorBase):

@@ -5,7 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+from osel_sim.interface.selector import Choice, Context, State
+from osel_sim.selection.base import SelectorBase
 
 
 class UniformSelector(SelectorBase):

@@ -10,8 +10,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from osel_sim.errors import UsageError
-from osel_sim.selection.protocol import Choice, Context, SelectorBase, State
+from osel_sim.core.errors import UsageError
+from osel_sim.interface.selector import Choice, Context, State
+from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.scaling import RunningComponents
 
 COMPONENTS = 32

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.sim import tables
+from osel_sim.sim import table_tops as tables
 from osel_sim.sim.perturbation import CLEAN, CameraShift, Perturbation
 from osel_sim.sim.scene import AGENTVIEW_TARGET, CAMERA_NAMES
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 from osel_sim.sim.appearance import Appearance
 from osel_sim.sim.scene import CAMERA_NAMES, full_model
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.formats.task_file import TaskSpec, load_task_file
-from osel_sim.policy.base import ACTION_DIM, CONTROL_HZ, STATE_DIM, Observation
+from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM, Observation
 from osel_sim.sim import predicates
 from osel_sim.sim.instance import Instance, make_instance
 from osel_sim.sim.world import Snapshot, World
@@ -55,7 +55,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
 
         choose_backend()  # before robosuite is imported: it forces EGL otherwise
         if isinstance(task, str):
-            from osel_sim import content
+            from osel_sim.core import content
 
             task = load_task_file(content.find("tasks", task))
         from osel_sim.sim.cameras import Cameras
@@ -116,7 +116,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         self._advance_subgoals()
 
     def observe(self, cameras: Sequence[str], size: int) -> Observation:
-        """What a policy is shown now, rendered now (see `osel_sim.policy.base.Observation`)."""
+        """What a policy is shown now, rendered now (see `osel_sim.interface.policy.Observation`)."""
         observation: Observation = {f"observation.images.{camera}": self.image(camera, size, size) for camera in cameras}
         observation["observation.state"] = self._state()
         observation["task"] = self.instance.instruction

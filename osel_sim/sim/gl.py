@@ -16,7 +16,7 @@ from functools import cache
 from types import ModuleType
 from typing import Any
 
-from osel_sim.errors import DisplayError
+from osel_sim.core.errors import DisplayError
 
 BACKENDS = ("cgl",) if platform.system() == "Darwin" else ("egl", "osmesa", "glfw")
 HEADLESS = tuple(backend for backend in BACKENDS if backend != "glfw")

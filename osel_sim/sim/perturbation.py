@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from osel_sim.formats.task_file import Region
+from osel_sim.formats.task_schema import Region
 
 type Triple = tuple[float, float, float]
 type Stream = Callable[[str], np.random.Generator]
@@ -47,7 +47,7 @@ class Perturbation:
         ambient: factor of the light that comes from everywhere.
         camera: of the agentview camera.
         wrist: metres (3) and radians (3) by which the wrist camera sits otherwise, in its own frame.
-        table: name of the table top (`osel_sim.sim.tables`); empty for its own.
+        table: name of the table top (`osel_sim.sim.table_tops`); empty for its own.
         table_tint: factors of its red, green and blue.
         tints: thing -> (paleness, red, green, blue): so much white is mixed in, then colours are multiplied.
         sizes: object -> factor.
@@ -157,7 +157,7 @@ def _camera(level: int, rng: np.random.Generator) -> dict[str, object]:
 
 
 def _table(level: int, rng: np.random.Generator) -> dict[str, object]:
-    from osel_sim.sim.tables import OF_LEVEL
+    from osel_sim.sim.table_tops import OF_LEVEL
 
     names = OF_LEVEL[level]
     tint = tuple(1.0 - float(rng.uniform(0.0, TABLE_TINT[level])) for _ in range(3))

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from osel_sim import content
-from osel_sim.errors import ContentError
-from osel_sim.formats.task_file import Entity
+from osel_sim.core import content
+from osel_sim.core.errors import ContentError
+from osel_sim.formats.catalogue import Entity
 
 TABLE_HEIGHT = 0.8
 TABLE_SIZE = (0.8, 0.8, 0.05)
@@ -47,7 +47,7 @@ def _build(entities: tuple[Entity, ...]) -> Scene:
 
     from osel_sim.sim.gl import quiet_robosuite
     from osel_sim.sim.light_meshes import lighten
-    from osel_sim.sim.tables import add_tables
+    from osel_sim.sim.table_tops import add_tables
 
     quiet_robosuite()
     xml, root_bodies, initial_qpos = _compose(entities)
@@ -61,7 +61,7 @@ def full_model(xml: str) -> Any:
     """The same scene with robosuite's own meshes, for videos."""
     import mujoco
 
-    from osel_sim.sim.tables import add_tables
+    from osel_sim.sim.table_tops import add_tables
 
     spec = mujoco.MjSpec.from_string(xml)
     add_tables(spec)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import ContentError
+from osel_sim.core.errors import ContentError
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.sim.appearance import Appearance
 from osel_sim.sim.control import Control

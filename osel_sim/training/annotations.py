@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
 from osel_sim.training.projection import Pinhole
 
 SIDE_FILE = "osel_sim.json"

@@ -18,8 +18,8 @@ import pyarrow.parquet as parquet
 from numpy.typing import NDArray
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from osel_sim.errors import DataError
-from osel_sim.policy.base import ACTION_DIM, STATE_DIM
+from osel_sim.core.errors import DataError
+from osel_sim.interface.policy import ACTION_DIM, STATE_DIM
 from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations, read_json
 
 IMAGES = "observation.images."

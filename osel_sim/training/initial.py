@@ -10,7 +10,7 @@ from lerobot.processor import NormalizerProcessorStep
 from safetensors.torch import load_file
 from torch import nn
 
-from osel_sim.errors import CheckpointError
+from osel_sim.core.errors import CheckpointError
 from osel_sim.policy import register
 from osel_sim.policy.perception_step import PerceptionStep
 from osel_sim.training.batches import Statistics

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm  # type: ignore[import-untyped]
 
-from osel_sim.precision import computes_bfloat16
+from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.training.recipe import Optimisation
 from osel_sim.training.state import load_state, save_state
 
@@ -62,7 +62,7 @@ class Trainer:
         if state is None:
             return False
         if state["fingerprint"] != self._fingerprint:
-            from osel_sim.errors import DataError
+            from osel_sim.core.errors import DataError
 
             raise DataError(f"{self._folder}: was trained with other data, seed or recipe; give those, or another --out")
         self.policy.load_state_dict(state["policy"])

@@ -13,10 +13,10 @@ from lerobot.policies.factory import get_policy_class, make_policy_config, make_
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, nn
 
-from osel_sim.errors import UsageError
+from osel_sim.core.errors import UsageError
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.policy import ACTION_DIM, STATE_DIM
 from osel_sim.policy import register
-from osel_sim.policy.base import ACTION_DIM, STATE_DIM
 from osel_sim.policy.language_chunk import LanguageChunkConfig
 from osel_sim.policy.perception import Perception, PerceptionConfig, percept_size
 from osel_sim.policy.perception_step import PerceptionStep

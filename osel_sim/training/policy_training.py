@@ -17,10 +17,10 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from numpy.typing import NDArray
 
-from osel_sim import content
-from osel_sim.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core import content
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.precision import computes_bfloat16
 from osel_sim.training.batches import Batches, frames_of, statistics_of
 from osel_sim.training.dataset import Demonstrations, dataset_folders, load_demonstrations, task_of
 from osel_sim.training.evaluation import validate

@@ -3,7 +3,7 @@
 import dataclasses
 from pathlib import Path
 
-from osel_sim.errors import PolicyError
+from osel_sim.core.errors import PolicyError
 from osel_sim.formats.policy_file import PolicySpec
 
 
@@ -18,10 +18,10 @@ def success_rate(spec: PolicySpec, checkpoint: Path, task: str, episodes: int, s
     Raises:
         PolicyError: an episode ended as an error, which is no failure of the policy.
     """
-    from osel_sim import content
-    from osel_sim.episode import Driver, run_episode
+    from osel_sim.core import content
+    from osel_sim.episodes.loop import Driver, run_episode
     from osel_sim.formats.task_file import load_task_file
-    from osel_sim.policy.call import LocalCaller
+    from osel_sim.policy.local import LocalCaller
     from osel_sim.policy.registry import make_policy
     from osel_sim.sim.env import TaskEnv
     from osel_sim.sim.instance import make_instance

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from osel_sim.errors import DataError
+from osel_sim.core.errors import DataError
 
 STATE_FILE = "training_state.pt"
 

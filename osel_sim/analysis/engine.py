@@ -1,0 +1,206 @@
+"""Replays of selectors over streams of a log, in processes; the result does not depend on how many."""
+
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.analysis.log import LoggedOutcomes
+from osel_sim.analysis.streams import Streams, draw_streams
+from osel_sim.analysis.warm_start import Beforehand, show
+from osel_sim.core.errors import OselError, UsageError
+from osel_sim.core.processes import end_with_parent
+from osel_sim.formats.replay_result import Choices
+from osel_sim.selection.reward import RewardWeights
+
+WARM = ":warm"
+"""Ending of the name of a selector that is shown all outcomes of other instances before its stream begins."""
+
+SLOW_FIRST = ("ppo", "auto:warm", "auto", "neural_linear", "ppo_tuned", "vw_regcb", "vw_squarecb")
+"""Selectors whose replays take longest are begun first, so that no worker is left with a long one at the end."""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Under what a log is replayed.
+
+    Attributes:
+        weights: of the reward.
+        settings: selector -> keyword arguments, where they are not to be the defaults.
+        beforehand: of other instances than the log's; needed for selectors named `NAME:warm`.
+    """
+
+    weights: RewardWeights
+    settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    beforehand: Beforehand | None = None
+
+
+@dataclass(frozen=True)
+class _Material:
+    """What a worker needs: contexts float32 (N, D), seeds, policies, and of each setup its rewards (N, P, R) and its streams."""
+
+    contexts: NDArray[np.float32]
+    seeds: tuple[int, ...]
+    policies: tuple[str, ...]
+    setups: tuple[Setup, ...]
+    rewards: tuple[NDArray[np.float64], ...]
+    streams: tuple[Streams, ...]
+
+
+_Job = tuple[int, str, int]
+"""Which setup, which selector, which seed (its position)."""
+
+
+def replay(
+    log: LoggedOutcomes,
+    setups: Sequence[Setup],
+    selectors: Sequence[str],
+    seeds: Sequence[int],
+    decisions: int | None = None,
+    workers: int = 1,
+    progress: Callable[[int], Any] | None = None,
+) -> list[Choices]:
+    """Show the streams of all seeds to every selector, under each setup.
+
+    Args:
+        log: complete instances only (`osel_sim.analysis.streams.complete_instances`).
+        selectors: names, as `osel_sim.selection.registry.make_selector` takes them; `NAME:warm` for one that is shown what is known `beforehand`.
+        seeds: of the streams, and of the selectors.
+        decisions: length of a stream; None: all instances.
+        workers: processes; with 1 it happens in this one.
+        progress: called with a number of decisions made.
+
+    Raises:
+        UsageError: a selector is to start warm and there is nothing to show it.
+    """
+    warm = [name for name in selectors if name.endswith(WARM)]
+    if warm and any(setup.beforehand is None for setup in setups):
+        raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to show beforehand")
+    tables = tuple(log.rewards(setup.weights) for setup in setups)
+    streams = tuple(draw_streams(table, seeds, decisions) for table in tables)
+    material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams)
+    jobs = [(at, name, number) for name in sorted(selectors, key=_slowness) for at in range(len(setups)) for number in range(len(seeds))]
+    chosen = [{name: np.zeros(own.order.shape, np.int8) for name in selectors} for own in streams]
+    for (at, name, number), columns in _run(material, jobs, workers):
+        chosen[at][name][number] = columns
+        if progress is not None:
+            progress(len(columns))
+    return [Choices(log.keys, log.policies, own.order, own.repeats, names) for own, names in zip(streams, chosen, strict=True)]
+
+
+def replay_one(
+    name: str,
+    contexts: NDArray[np.float32],
+    rewards: NDArray[np.float64],
+    policies: Sequence[str],
+    seed: int,
+    beforehand: Beforehand | None = None,
+    **settings: Any,
+) -> NDArray[np.int8]:
+    """Show one stream to one selector, which sees the reward of its choices only.
+
+    Args:
+        contexts: (T, D). rewards: (T, P).
+        beforehand: shown first, in an order of the seed's.
+        settings: of the selector.
+
+    Returns:
+        columns chosen, (T,).
+    """
+    from osel_sim.selection.ppo.compiled import FastPPO, supports
+    from osel_sim.selection.ppo.sb3 import PPOSelector
+    from osel_sim.selection.registry import make_selector
+
+    selector = make_selector(name, policies, contexts.shape[1], seed, **settings)
+    if beforehand is not None:
+        show(selector, beforehand, policies, seed)
+    if isinstance(selector, PPOSelector) and supports(selector):
+        return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
+    column = {policy: index for index, policy in enumerate(policies)}
+    chosen = np.zeros(len(contexts), np.int8)
+    for decision, context in enumerate(contexts):
+        choice = selector.select(context)
+        chosen[decision] = column[choice.policy]
+        selector.update(context, choice, float(rewards[decision, chosen[decision]]))
+    return chosen
+
+
+def _slowness(name: str) -> int:
+    return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
+
+
+def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
+    if workers == 1:
+        with _one_thread():
+            for job in jobs:
+                yield _replay_job(material, job)
+        return
+    context = multiprocessing.get_context("spawn")  # a forked torch or numba is a hang waiting to happen
+    with ProcessPoolExecutor(workers, context, _prepare, (material,)) as pool:
+        try:
+            for future in as_completed([pool.submit(_in_worker, job) for job in jobs]):
+                yield future.result()
+        except BrokenProcessPool:
+            raise OselError("a worker process of the replay died (out of memory?); try --workers 1") from None
+        except BaseException:
+            # Otherwise leaving the pool waits for the replays that are running.
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+_material: _Material | None = None
+
+
+def _prepare(material: _Material) -> None:
+    """Make a worker ready."""
+    global _material
+    end_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C: end without a word, the parent says what there is to say
+    _limit_threads()
+    _material = material
+
+
+def _in_worker(job: _Job) -> tuple[_Job, NDArray[np.int8]]:
+    if _material is None:
+        raise OselError("a worker process of the replay was not prepared")
+    return _replay_job(_material, job)
+
+
+def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int8]]:
+    at, name, number = job
+    setup, streams = material.setups[at], material.streams[at]
+    rewards = streams.rewards(material.rewards[at], number)
+    contexts = material.contexts[streams.order[number]]
+    contexts.flags.writeable = False
+    kind, shown = name.removesuffix(WARM), setup.beforehand if name.endswith(WARM) else None
+    return job, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, **setup.settings.get(name, {}))
+
+
+def _limit_threads() -> Any:
+    """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    torch.set_num_threads(1)
+    return threadpool_limits(1)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    import torch
+
+    threads = torch.get_num_threads()
+    try:
+        with _limit_threads():
+            yield
+    finally:
+        torch.set_num_threads(threads)

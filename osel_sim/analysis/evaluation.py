@@ -1,0 +1,59 @@
+"""Off-policy estimates of a live run: each fixed policy, random choice, and the best choice by a linear model."""
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from osel_sim.analysis.live import LiveLog
+from osel_sim.analysis.off_policy import estimate, forward_model, greedy
+from osel_sim.core.errors import DataError
+from osel_sim.selection.reward import RewardWeights
+from osel_sim.statistics.intervals import bootstrap_mean_interval
+
+
+def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
+    """What `off_policy.json` holds, and `replay.json` under `off_policy`.
+
+    Returns:
+        run (folder, selector, decisions, errors, mean_reward, ci95), reward, policies, targets: name -> `osel_sim.analysis.off_policy.Estimate`.
+        The targets are `fixed:<policy>`, `random`, and `greedy`: the policy of the highest reward by a linear model of the decisions so far.
+
+    Raises:
+        DataError: every decision ended in error.
+    """
+    log = live.outcomes
+    received = log.rewards(weights)[np.arange(len(log)), live.chosen, 0]
+    valid = np.isfinite(received)
+    if not valid.any():
+        raise DataError(f"{log.source}: none of {len(log)} decisions has a reward")
+    rewards, chosen, propensities, contexts = received[valid], live.chosen[valid], live.propensities[valid], log.contexts[valid]
+    # An episode that ends in error has no reward. Where that happens to some policies more than to others, what is left has fewer decisions of
+    # those than the run meant to make: each counts as chosen with the probability of being chosen and of ending well.
+    share = np.array([valid[live.chosen == column].mean() if (live.chosen == column).any() else 1.0 for column in range(len(log.policies))])
+    propensities = propensities * share / valid.mean()
+    model = forward_model(contexts, rewards, chosen, len(log.policies))
+    targets = {f"fixed:{policy}": np.tile(np.eye(len(log.policies))[column], (len(rewards), 1)) for column, policy in enumerate(log.policies)}
+    targets |= {"random": np.full_like(propensities, 1.0 / len(log.policies)), "greedy": greedy(model)}
+    found = {name: asdict(estimate(rewards, chosen, propensities, target, model)) for name, target in targets.items()}
+    return {
+        "run": {
+            "folder": str(log.source),
+            "selector": live.selector,
+            "decisions": len(rewards),
+            "errors": int((~valid).sum()),
+            "mean_reward": float(rewards.mean()),
+            "ci95": list(bootstrap_mean_interval(rewards)),
+        },
+        "reward": asdict(weights),
+        "policies": list(log.policies),
+        "targets": {name: {key: _json(value) for key, value in entry.items()} for name, entry in found.items()},
+    }
+
+
+def _json(value: float | tuple[float, float] | None) -> float | list[float] | None:
+    """An interval as a list; None where it is unbounded."""
+    if not isinstance(value, tuple):
+        return value
+    return list(value) if all(math.isfinite(end) for end in value) else None

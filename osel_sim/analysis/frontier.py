@@ -1,0 +1,160 @@
+"""Success against seconds and against price as one weight sweeps from nothing to where it settles everything."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.analysis.clusters import find_clusters, score_of
+from osel_sim.analysis.engine import Setup, replay
+from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
+from osel_sim.analysis.weights_map import Axis, limits, moved, swept
+from osel_sim.selection.reward import RewardWeights
+
+_POINTS = 49
+_REPLAYED = 6
+"""Weights at which selectors are replayed: a replay takes seconds where an oracle takes none."""
+_DECISIONS = 1_000
+_SEEDS_FOR_EACH = 20
+
+Chooser = Callable[[Array], NDArray[np.int64]]
+"""Of rewards (N, P): the column chosen for each instance, (N,)."""
+
+
+@dataclass(frozen=True)
+class Frontier:
+    """What a way of choosing comes to at each weight.
+
+    Attributes:
+        name: `hindsight oracle`, or `best policy of each cluster`.
+        weights: (K,) the weight that sweeps; the other is as given.
+        means: what `measured` names -> (K,) means over the instances.
+    """
+
+    name: str
+    weights: Array
+    means: dict[str, Array]
+
+
+def measured(log: LoggedOutcomes, weights: RewardWeights) -> dict[str, Array]:
+    """What a frontier shows of every episode, (N, P, R) each: `score` (what the reward counts as success), `seconds` or `steps`, and `price`."""
+    time = {"steps": log.steps} if weights.time_unit == "steps" else {"seconds": log.seconds}
+    return {"score": score_of(log, weights), **time, "price": log.price}
+
+
+def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWeights, sweep: Axis, high: float) -> list[Frontier]:
+    """Frontiers of the hindsight oracle and of the best policy of each cluster.
+
+    The cluster's policy is chosen on the half of the instances that the one at hand is not in; what it comes to is then what one could have had. It
+    stands for a selector that has learnt all that the clusters tell. Selectors that learn are replayed at each weight (`selector_frontiers`).
+
+    Args:
+        labels: (N,) cluster of each instance.
+        sweep: which weight.
+        high: up to where, from a ten-thousandth of it, and 0.
+    """
+    rows = swept(log, weights).rows
+    part, own = log.take(rows), labels[rows]
+    first = part.first_half()
+    values = np.concatenate([[0.0], np.geomspace(high / 10_000, high, _POINTS - 1)])
+    tables = {key: mean_over_repeats(table) for key, table in measured(part, weights).items()}
+    choosers: dict[str, Chooser] = {"hindsight oracle": lambda rewards: rewards.argmax(axis=1)}
+    if first.any() and not first.all():
+        choosers["best policy of each cluster"] = lambda rewards: _by_cluster(rewards, own, first)
+    found = []
+    for name, choose in choosers.items():
+        columns = [choose(part.mean_rewards(moved(weights, sweep, float(value)))) for value in values]
+        every = np.arange(len(part))
+        means = {key: np.array([_mean(table[every, chosen]) for chosen in columns]) for key, table in tables.items()}
+        found.append(Frontier(name, values, means))
+    return found
+
+
+def selector_frontiers(
+    log: LoggedOutcomes,
+    setup: Callable[[RewardWeights], Setup],
+    weights: RewardWeights,
+    selectors: Sequence[str],
+    seeds: int,
+    decisions: int | None,
+    workers: int,
+    progress: Callable[[int, int], Any],
+) -> dict[str, Any]:
+    """Frontiers of selectors that learn, replayed anew at each of a few weights: means over the last quarter of their streams.
+
+    A few streams end in other instances than the log is made of, and long tasks among them would move a whole line. So every cluster counts by its
+    share of the log (post-stratification), which takes three quarters of that away from the seconds of auto on the shipped log.
+
+    Args:
+        log: complete instances only.
+        setup: under what to replay at other weights.
+        weights: in the middle.
+        seeds, decisions: of the replay that this goes with; one in twenty of the seeds and 1,000 decisions at most are replayed at each weight.
+        progress: called with a number of decisions made, and that of all there will be.
+
+    Returns:
+        seeds, decisions, and of each weight that can be moved: weights [K] from 0, selectors {name: means as `measured` names them}, [K] each, None
+        where unknown.
+
+    Raises:
+        DataError: there are too few instances for clusters, which say up to where to look.
+    """
+    labels, rows = find_clusters(log.contexts).labels, swept(log, weights).rows
+    ends, part, labels = limits(log, labels, weights), log.take(rows), labels[rows]
+    streams = range(max(1, seeds // _SEEDS_FOR_EACH))
+    length = min(len(part), _DECISIONS, decisions or _DECISIONS)
+    late = slice(length * 3 // 4, None)
+    tables = measured(part, weights)
+    found: dict[str, Any] = {"seeds": len(streams), "decisions": length}
+    total, made = len(ends) * _REPLAYED * len(selectors) * len(streams) * length, 0
+
+    def count(number: int) -> None:
+        nonlocal made
+        made += number
+        progress(made, total)
+
+    for axis, high in ends.items():
+        values = np.concatenate([[0.0], np.geomspace(high / 300, high, _REPLAYED - 1)])
+        setups = [setup(moved(weights, axis, float(value))) for value in values]
+        choices = replay(part, setups, selectors, streams, length, workers, count)
+        found[axis] = {
+            "weights": values.tolist(),
+            "selectors": {
+                selector: {
+                    name: [_known(_weighted(own.received(selector, table)[:, late], labels[own.order[:, late]], labels)) for own in choices]
+                    for name, table in tables.items()
+                }
+                for selector in selectors
+            },
+        }
+    return found
+
+
+def _by_cluster(rewards: Array, labels: NDArray[np.int64], first: NDArray[np.bool_]) -> NDArray[np.int64]:
+    chosen = np.empty(len(rewards), np.int64)
+    for choosing in (first, ~first):
+        overall = int(rewards[choosing].mean(axis=0).argmax())
+        for number in np.unique(labels):
+            known = choosing & (labels == number)
+            chosen[~choosing & (labels == number)] = int(rewards[known].mean(axis=0).argmax()) if known.any() else overall
+    return chosen
+
+
+def _mean(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else float("nan")
+
+
+def _weighted(values: Array, clusters: NDArray[np.int64], everywhere: NDArray[np.int64]) -> float:
+    """Mean of values (S, T) of instances of these clusters (S, T), each cluster by its share everywhere (N,); of those it has values of."""
+    known = np.isfinite(values)
+    numbers, shares = np.unique(everywhere, return_counts=True)
+    means = np.array([_mean(values[known & (clusters == number)]) for number in numbers])
+    found = np.isfinite(means)
+    return float(np.average(means[found], weights=shares[found])) if found.any() else float("nan")
+
+
+def _known(value: float) -> float | None:
+    return value if np.isfinite(value) else None

@@ -1,0 +1,177 @@
+"""What a replay's choices came to: rewards with intervals, share of the learnable gap, regret, differences."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from osel_sim.analysis.log import Array, LoggedOutcomes
+from osel_sim.analysis.oracles import Oracles
+from osel_sim.formats.replay_result import Choices
+from osel_sim.selection.reward import RewardWeights
+from osel_sim.statistics.intervals import RESAMPLES, Interval, bootstrap_mean_interval, bootstrap_means
+
+LATE = 0.25
+"""The share of a stream's decisions that counts as late."""
+
+NOT_APART = 0.025
+"""Of so many bootstrap draws without a gap on, its share has no interval: it is not bounded."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What was received and what could have been, in every decision of every seed, (S, T).
+
+    Attributes:
+        selectors: name -> reward.
+        oracles: hindsight, expected (where there are repeats), predictable, per_task, best_single -> reward.
+        learnable: which oracle bounds what can be learned.
+        late: first decision of the late part.
+        expected_errors: how far the mean of the expected oracle may be off, as it was measured on the instances with repeats: bootstrap draws,
+            (RESAMPLES,); zeros without repeats.
+    """
+
+    selectors: dict[str, Array]
+    oracles: dict[str, Array]
+    learnable: str
+    late: int
+    expected_errors: Array
+
+    def errors(self, oracle: str) -> Array:
+        """How far the mean of an oracle may be off, (RESAMPLES,): only the expected one is an estimate."""
+        return self.expected_errors if oracle == "expected" else np.zeros(RESAMPLES)
+
+    def interval(self, oracle: str, values: Array) -> Interval:
+        """95 % bootstrap interval of the mean of values (S, T) that an oracle's rewards went into: over seeds and what the oracle may be off."""
+        low, high = np.quantile(bootstrap_means(units(values)) + self.errors(oracle), [0.025, 0.975])
+        return float(low), float(high)
+
+
+def curves(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: Oracles) -> Curves:
+    """Rewards decision by decision.
+
+    Args:
+        log: the instances of `choices`, in its order.
+        best: of the same log and weights.
+    """
+    table = log.rewards(weights)
+    outcomes = choices.outcomes(table)
+    tasks = best.per_task[choices.order][:, :, None]
+    found = {
+        "hindsight": outcomes.max(axis=2),
+        **({} if best.expected is None else {"expected": best.expected[choices.order]}),
+        "predictable": best.predictable[choices.order],
+        "per_task": np.take_along_axis(outcomes, tasks, axis=2)[:, :, 0],
+        "best_single": outcomes[:, :, best.best_single],
+    }
+    decisions = choices.order.shape[1]
+    received = {name: choices.received(name, table) for name in choices.chosen}
+    gains = best.expected_gains
+    errors = bootstrap_means(gains, seed=1) - gains.mean() if len(gains) else np.zeros(RESAMPLES)  # another seed than that of the streams' resampling
+    return Curves(received, found, best.learnable, decisions - max(1, int(decisions * LATE)), errors)
+
+
+def units(values: Array) -> Array:
+    """What is drawn anew for an interval of the mean of values (S, T): the seeds' means; of a single seed its decisions."""
+    return np.asarray(values.mean(axis=1) if len(values) > 1 else values[0], np.float64)
+
+
+def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -> dict[str, Any]:
+    """One selector: what `replay.json` says about it under `selectors`."""
+    received = rewards.selectors[name]
+    of_each = {"success": log.success, "subgoals": log.subgoals, "score": log.score, "steps": log.steps, "seconds": log.seconds, "price": log.price}
+    got = {what: _mean(choices.received(name, values)) for what, values in of_each.items()}
+    chosen = choices.chosen[name]
+    late = slice(rewards.late, None)
+    successes = choices.received(name, log.success)
+    return {
+        "mean_reward": float(received.mean()),
+        "ci95": list(bootstrap_mean_interval(units(received))),
+        "mean_reward_late": float(received[:, late].mean()),
+        "success_rate": got["success"],
+        "success_ci95": list(bootstrap_mean_interval(units(successes))) if got["success"] is not None else None,
+        "mean_subgoals": got["subgoals"],
+        "mean_score": got["score"],
+        "mean_steps": got["steps"],
+        "mean_seconds": got["seconds"],
+        "mean_price": got["price"],
+        "shares": {policy: float((chosen == column).mean()) for column, policy in enumerate(choices.policies)},
+        "shares_late": {policy: float((chosen[:, late] == column).mean()) for column, policy in enumerate(choices.policies)},
+        **_gap_entries("learnable_gap_closed", gap_closed(received, rewards, rewards.learnable, 0)),
+        **_gap_entries("learnable_gap_closed_late", gap_closed(received, rewards, rewards.learnable, rewards.late)),
+        **_gap_entries("predictable_gap_closed", gap_closed(received, rewards, "predictable", 0)),
+        **_gap_entries("predictable_gap_closed_late", gap_closed(received, rewards, "predictable", rewards.late)),
+        "regret": {oracle: float((values - received).mean()) for oracle, values in rewards.oracles.items()},
+        "regret_ci95": {oracle: list(rewards.interval(oracle, values - received)) for oracle, values in rewards.oracles.items()},
+        "decisions_until_ahead": until_ahead(received - rewards.oracles["best_single"]),
+        "decisions_until_better": until_better(received - rewards.oracles["best_single"]),
+    }
+
+
+def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tuple[float, Interval | None] | None:
+    """Share of the gap to an oracle closed from decision `first` on, with its 95 % bootstrap interval over seeds and, for the expected oracle, over
+    the instances with repeats that it was measured on.
+
+    (selector - best single) / (oracle - best single), all averaged over seeds and decisions. None where the oracle is not better than the best
+    single policy, so that there is no gap to close; no interval where it may well not be: more than `NOT_APART` of the draws have no gap.
+    """
+    base = rewards.oracles["best_single"][:, first:]
+    gains, gaps = units(received[:, first:] - base), units(rewards.oracles[oracle][:, first:] - base)
+    if gaps.mean() <= 0.0:
+        return None
+    share = float(gains.mean() / gaps.mean())
+    # The same seed draws the same units for both.
+    above, below = bootstrap_means(gains), bootstrap_means(gaps) + rewards.errors(oracle)
+    if (below <= 0.0).mean() > NOT_APART:
+        return share, None
+    low, high = np.quantile(above[below > 0.0] / below[below > 0.0], [0.025, 0.975])
+    return share, (float(low), float(high))
+
+
+def until_ahead(differences: Array) -> int | None:
+    """After how many decisions the sum of the differences (S, T), averaged over seeds, is positive and stays so; None: not at the end."""
+    total = differences.mean(axis=0).cumsum()
+    behind = np.flatnonzero(total <= 0.0)
+    if not len(behind):
+        return 1
+    return None if behind[-1] == len(total) - 1 else int(behind[-1]) + 2
+
+
+def until_better(differences: Array) -> int | None:
+    """After how many decisions the sum of the differences (S, T), averaged over seeds, is lowest: later ones win more than they lose."""
+    # At the end it has not begun to win yet.
+    total = np.concatenate([[0.0], differences.mean(axis=0).cumsum()])
+    lowest = int(total.argmin())
+    return None if lowest == len(total) - 1 else lowest
+
+
+def paired(rewards: Curves, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Mean differences in reward between any two selectors on the same streams, with bootstrap intervals over seeds."""
+    result = []
+    for index, one in enumerate(names):
+        for other in names[index + 1 :]:
+            apart = rewards.selectors[one] - rewards.selectors[other]
+            difference, late = units(apart), units(apart[:, rewards.late :])
+            result.append(
+                {
+                    "a": one,
+                    "b": other,
+                    "difference": float(difference.mean()),
+                    "ci95": list(bootstrap_mean_interval(difference)),
+                    "difference_late": float(late.mean()),
+                    "ci95_late": list(bootstrap_mean_interval(late)),
+                }
+            )
+    return result
+
+
+def _gap_entries(name: str, found: tuple[float, Interval | None] | None) -> dict[str, Any]:
+    share, interval = found or (None, None)
+    return {name: share, f"{name}_ci95": None if interval is None else list(interval)}
+
+
+def _mean(values: Array) -> float | None:
+    """Mean of what is known; None where nothing is."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else None

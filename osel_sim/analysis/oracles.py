@@ -1,0 +1,148 @@
+"""What the best could have been on a log: four oracles, never mixed up, and the best single policy.
+
+Each says what a chooser would receive on every instance, so that it can be averaged over just the instances that a selector was shown.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
+from osel_sim.core.errors import DataError
+from osel_sim.selection.reward import RewardWeights
+
+GROUPINGS = ("task", "target", "container", "phrasing")
+"""Attributes of an instance that the predictable oracle may know."""
+
+SHRINK = 4.0
+"""A group's mean rewards count as if so many more instances of the group had the mean of all: a small group says little."""
+
+
+@dataclass(frozen=True)
+class Oracles:
+    """N instances, P policies.
+
+    Attributes:
+        best_single, worst_single: columns of the policies with the highest and the lowest mean reward over all instances.
+        expected: (N,) reward of the policy that was best on the same instance in other repeats, an estimate where it has none; None without repeats.
+        expected_gains: what it has over `predictable` on each of the instances with repeats; the mean of `expected` is as sure as theirs.
+        predictable: (N,) reward of the policy that was best on *other* instances of the same group (by task, target, container, phrasing).
+        grouping: the attributes it went by, for each half of the instances (`first`, `second`) it was scored on.
+        per_task: column of the policy with the highest mean reward on each instance's task, (N,).
+    """
+
+    best_single: int
+    worst_single: int
+    expected: Array | None
+    expected_gains: Array
+    predictable: Array
+    grouping: dict[str, tuple[str, ...]]
+    per_task: NDArray[np.int64]
+
+    @property
+    def learnable(self) -> str:
+        """The oracle that bounds what can be learned: `expected` where there is one, else `predictable`."""
+        return "predictable" if self.expected is None else "expected"
+
+
+def oracles(log: LoggedOutcomes, weights: RewardWeights) -> Oracles:
+    """Compute them over complete instances (`osel_sim.analysis.streams.complete_instances`)."""
+    rewards = log.rewards(weights)
+    means = mean_over_repeats(rewards)
+    if not len(means) or not np.isfinite(means).all():
+        raise DataError(f"{log.source}: oracles need an outcome of every policy on every instance")
+    predictable, grouping = predictable_oracle(log, means)
+    overall = means.mean(axis=0)
+    expected, gains = expected_oracle(rewards, predictable) or (None, np.zeros(0))
+    return Oracles(int(overall.argmax()), int(overall.argmin()), expected, gains, predictable, grouping, per_task(log, means))
+
+
+def expected_oracle(rewards: Array, reference: Array) -> tuple[Array, Array] | None:
+    """Best policy by its mean over one half of an instance's repeats, scored by its mean over the other half; mean of both ways round.
+
+    Chosen and scored on the same outcomes, luck would count as foresight. An instance on which some policy has a single repeat only cannot be split:
+    it gets the reference and, on top, the mean gain over the reference of those that can be, which have to be a fair sample of all. That is the
+    difference estimator of survey sampling (Cochran, Sampling Techniques, 1977, chapter 7): without bias whatever the reference, and the less it
+    depends on which instances were repeated, the nearer the reference comes to the oracle.
+
+    Args:
+        rewards: (N, P, R), NaN where there is no outcome.
+        reference: (N,) reward of some other way to choose on every instance, such as `predictable_oracle`.
+
+    Returns:
+        reward on every instance, (N,), and the gains over the reference of the instances that can be split; None if none can.
+    """
+    known = np.isfinite(rewards)
+    number = np.cumsum(known, axis=2) - 1  # the how-manieth valid repeat each is
+    first, second = (mean_over_repeats(np.where(known & (number % 2 == parity), rewards, np.nan)) for parity in (0, 1))
+    splits = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+    if not splits.any():
+        return None
+    rows = np.flatnonzero(splits)
+    one = second[rows, first[rows].argmax(axis=1)]
+    other = first[rows, second[rows].argmax(axis=1)]
+    gains = (one + other) / 2.0 - reference[rows]
+    value = reference + gains.mean()
+    value[rows] = reference[rows] + gains
+    return value, gains
+
+
+def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[str, tuple[str, ...]]]:
+    """Best policy of an instance's group, chosen on one half of the instances and scored on the other, both ways round.
+
+    Which attributes make the groups is chosen on the choosing half as well (on one part of it, scored on the other): nothing scored had a say.
+    The halves are other ones than the log's own, so that a log of which only one of those is replayed still has both.
+
+    Args:
+        means: (N, P) mean rewards.
+
+    Returns:
+        its reward on every instance, (N,), and the grouping used for each half.
+    """
+    labels = {name: log.labels(name) for name in GROUPINGS}
+    varying = [name for name in GROUPINGS if len(set(labels[name])) > 1]
+    candidates = [names for size in range(len(varying) + 1) for names in combinations(varying, size)]
+    groups = {names: _groups([labels[name] for name in names], len(log)) for names in candidates}
+    half, quarter = (np.array([bool(hashlib.sha256(key.encode()).digest()[byte] & 1) for key in log.keys], bool) for byte in (1, 2))
+    value, used = np.full(len(log), np.nan), {}
+    for name, scored in (("first", ~half), ("second", half)):
+        choosing = ~scored
+
+        def held_out(names: tuple[str, ...], choosing: NDArray[np.bool_] = choosing) -> float:
+            parts = ((choosing & quarter, choosing & ~quarter), (choosing & ~quarter, choosing & quarter))
+            return sum(float(_choose(means, groups[names], by, on).sum()) for by, on in parts)
+
+        best = max(candidates, key=held_out)  # the first, thus the coarsest, where several are equal
+        value[scored] = _choose(means, groups[best], choosing, scored)
+        used[name] = best
+    return value, used
+
+
+def per_task(log: LoggedOutcomes, means: Array) -> NDArray[np.int64]:
+    """Column of the policy with the highest mean reward on each instance's task, (N,); chosen and scored on the same outcomes."""
+    groups = _groups([log.labels("task")], len(log))
+    best = np.array([means[groups == group].mean(axis=0).argmax() for group in range(groups.max() + 1)], np.int64)
+    return best[groups]
+
+
+def _choose(means: Array, groups: NDArray[np.int64], by: NDArray[np.bool_], on: NDArray[np.bool_]) -> Array:
+    """Rewards on the instances `on` of the policy best in their group among the instances `by`."""
+    if not by.any() or not on.any():
+        return means[on].mean(axis=1)
+    overall = means[by].mean(axis=0)
+    counts = np.bincount(groups[by], minlength=groups.max() + 1)
+    sums = np.stack([np.bincount(groups[by], weights=means[by, column], minlength=groups.max() + 1) for column in range(means.shape[1])], axis=1)
+    shrunk = (sums + SHRINK * overall) / (counts[:, None] + SHRINK)
+    return np.asarray(means[on, shrunk.argmax(axis=1)[groups[on]]], np.float64)
+
+
+def _groups(labels: Sequence[Sequence[str]], count: int) -> NDArray[np.int64]:
+    """Number of each instance's group, (N,), from one list of labels an attribute."""
+    if not labels:
+        return np.zeros(count, np.int64)
+    numbers: dict[tuple[str, ...], int] = {}
+    return np.array([numbers.setdefault(row, len(numbers)) for row in zip(*labels, strict=True)], np.int64)

@@ -1,0 +1,66 @@
+"""The tasks and policies there are, for `python -m osel_sim.run --list`: reads TOML and nothing else."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from osel_sim.core import content
+from osel_sim.formats.policy_file import PolicySpec, load_policy_file
+from osel_sim.formats.task_file import TaskSpec, load_task_file
+
+
+def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str, list[dict[str, Any]]]:
+    """All tasks and policies, by name, as plain data.
+
+    Args:
+        tasks: a folder of the user's own task files.
+        policies: a folder of the user's own policy files.
+
+    Raises:
+        ContentError: a file is wrong.
+    """
+    return {
+        "tasks": [_task(load_task_file(file)) for _, file in sorted(content.files("tasks", tasks).items())],
+        "policies": [_policy(load_policy_file(file)) for _, file in sorted(content.files("policies", policies).items())],
+    }
+
+
+def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Path | None = None) -> None:
+    """Print the listing as tables, or as JSON."""
+    found = listing(tasks, policies)
+    if as_json:
+        print(json.dumps(found, indent=2))
+        return
+    from rich.table import Table
+
+    from osel_sim.cli.console import console
+
+    table = Table("task", "title", "tags", "steps", title="Tasks", title_justify="left")
+    for task in found["tasks"]:
+        table.add_row(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
+    console().print(table)
+    table = Table("policy", "title", "where", "kind", title="Policies", title_justify="left")
+    for policy in found["policies"]:
+        where = "local" if policy["remote"] is None else f"remote ({policy['remote']['network']})"
+        table.add_row(policy["name"], policy["title"], where + (", privileged" if policy["privileged"] else ""), policy["kind"])
+    console().print(table)
+
+
+def _task(task: TaskSpec) -> dict[str, Any]:
+    return {
+        "name": task.name,
+        "title": task.title,
+        "version": task.version,
+        "tags": list(task.tags),
+        "horizon": task.horizon,
+        "objects": [entity.name for entity in task.of_kind("object")],
+        "containers": [entity.name for entity in task.of_kind("container")],
+        "phrasings": {"train": len(task.train), "held_out": len(task.held_out)},
+        "file": str(task.file),
+    }
+
+
+def _policy(policy: PolicySpec) -> dict[str, Any]:
+    location = "remote" if policy.is_remote else "local"
+    return {**asdict(policy), "location": location, "privileged": policy.is_privileged, "file": str(policy.file)}

@@ -1,0 +1,128 @@
+"""What a rollout log says: success of every policy, overall and split by object, container and phrasing."""
+
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from osel_sim.cli.console import number, percent
+from osel_sim.formats.levels import label
+from osel_sim.formats.rollout_log import Row
+from osel_sim.selection.reward import RewardWeights, logged_reward, logged_seconds
+from osel_sim.statistics.intervals import effective_trials, wilson_interval
+
+SPLITS: dict[str, Callable[[Row], str | None]] = {
+    "task": lambda row: row.task,
+    "level": lambda row: None if row.level is None else label(row.level, row.axes),
+    "task at level": lambda row: None if row.level is None else f"{row.task} {label(row.level, row.axes)}",
+    "object": lambda row: row.target,
+    "container": lambda row: row.container,
+    "phrasing": lambda row: None if row.phrasing is None else row.phrasing.rpartition("-")[0].replace("_", "-") or row.phrasing,
+}
+"""What the rows are split by; None where a log from elsewhere does not have it."""
+
+
+def print_rollouts(console: Console, rows: Sequence[Row], weights: RewardWeights) -> None:
+    """Print the tables. Episodes that ended in error are counted, and left out of everything else.
+
+    Args:
+        weights: of the reward.
+    """
+    policies = list(dict.fromkeys(row.policy for row in rows))
+    console.print(_overall(rows, policies, weights))
+    split = _split(rows, policies)
+    if split.row_count:
+        console.print(split)
+
+
+def share_best(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeights) -> dict[str, float]:
+    """Share of the instances on which each policy has the highest mean reward over its repeats (the first, where several share it).
+
+    Only instances on which every policy has a valid outcome count; empty where there are none, such as where prices are not known.
+    """
+    rewards: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    for row in rows:
+        value = logged_reward(row, weights)
+        if value is not None:
+            rewards[row.instance][row.policy].append(value)
+    complete = [found for found in rewards.values() if all(policy in found for policy in policies)]
+    best = [max(policies, key=lambda policy: float(np.mean(found[policy]))) for found in complete]
+    return {policy: best.count(policy) / len(best) for policy in policies if best}
+
+
+def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeights) -> Table:
+    instances = len({row.instance for row in rows})
+    tasks = {row.task: None for row in rows}
+    title = f"{len(tasks)} tasks" if len(tasks) > 1 else next(iter(tasks), "")
+    table = Table(title=f"{title}: {instances} instances, {len(rows)} episodes", title_justify="left")
+    table.add_column("policy")
+    optional = {name: (heading, digits) for name, (heading, digits) in _MEASURES.items() if any(getattr(row, name) is not None for row in rows)}
+    timed = any(logged_seconds(row) is not None for row in rows)
+    headings = ["episodes", "success [95%]", *(heading for heading, _ in optional.values()), *(["seconds"] if timed else [])]
+    for heading in (*headings, "mean reward", "best on", "fallbacks", "errors"):
+        table.add_column(heading, justify="right")
+    best = share_best(rows, policies, weights)
+    for policy in policies:
+        own = [row for row in rows if row.policy == policy]
+        valid = [row for row in own if row.error is None]
+        measured = [number(_mean([getattr(row, name) for row in valid]), digits) for name, (_, digits) in optional.items()]
+        table.add_row(
+            policy,
+            str(len(own)),
+            _rate(valid),
+            *measured,
+            *([number(_mean([logged_seconds(row) for row in valid]))] if timed else []),
+            number(_mean([logged_reward(row, weights) for row in valid]), 3),
+            percent(best.get(policy)),
+            str(sum(row.fallback is not None for row in own)),
+            str(len(own) - len(valid)),
+        )
+    return table
+
+
+_MEASURES = {"subgoals": ("subgoals", 2), "score": ("score", 4), "steps": ("steps", 1), "price": ("price (cents)", 3)}
+"""Columns of the log that a log from elsewhere may lack: their headings and digits."""
+
+
+def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
+    table = Table(title="success [95%] by kind of instance", title_justify="left")
+    table.add_column("by")
+    table.add_column("")
+    table.add_column("instances", justify="right")
+    for policy in policies:
+        table.add_column(policy, justify="right")
+    kinds: dict[str, int] = {}
+    for name, key in SPLITS.items():
+        parts: dict[str, list[Row]] = defaultdict(list)
+        for row in rows:
+            value = key(row)
+            if value is not None:
+                parts[value].append(row)
+        kinds[name] = len(parts)
+        if name in ("task", "level") and len(parts) == 1:
+            continue  # all the same
+        if name == "task at level" and 1 in (kinds["task"], kinds["level"]):
+            continue  # shown already
+        for value, part in sorted(parts.items()):
+            rates = [_rate([row for row in part if row.policy == policy and row.error is None]) for policy in policies]
+            table.add_row(name, value, str(len({row.instance for row in part})), *rates)
+        table.add_section()
+    return table
+
+
+def _rate(valid: Sequence[Row]) -> str:
+    if not valid:
+        return "-"
+    by_instance: dict[str, list[bool]] = defaultdict(list)
+    for row in valid:
+        by_instance[row.instance].append(row.success)
+    rate = sum(row.success for row in valid) / len(valid)
+    trials = effective_trials([float(np.mean(successes)) for successes in by_instance.values()], len(valid))
+    return percent(rate, wilson_interval(min(rate * trials, trials), trials))
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None

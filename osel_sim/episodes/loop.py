@@ -1,0 +1,244 @@
+"""One episode: a policy drives the robot through one instance, on a virtual clock of 20 Hz control steps.
+
+The world does not wait for an answer. A call of d seconds takes ceil(20 d) control steps, in which the robot
+
+- holds still (`blocking`), then executes the first `execute` actions of the answer; or
+- finishes the chunk it has (`async`): after `execute` actions the next call is sent, and until it is answered the rest of the old chunk is executed,
+  then the robot holds still. Of the answer it skips as many actions as it made meanwhile, since both chunks planned them for the same moments.
+
+A local policy that answers within one control step (50 ms) takes none: it computes while the step runs, as control loops do.
+
+The loop knows nothing of videos, progress bars or timings: those are subscribers.
+"""
+
+import hashlib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.call import Call, Caller, Privileged
+from osel_sim.interface.outcome import Outcome, Seconds
+from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, Actions
+
+if TYPE_CHECKING:
+    from osel_sim.sim.env import TaskEnv
+    from osel_sim.sim.instance import Instance
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A policy ready to drive: its file and whom to ask."""
+
+    spec: PolicySpec
+    caller: Caller
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The world after one control step, as subscribers see it.
+
+    Attributes:
+        env: to render from; a subscriber must not step it.
+        policy: who drives (the fallback's name once it took over).
+        steps: control steps so far.
+        waiting: the robot held still in this step, since no answer was there.
+        price: cents so far.
+    """
+
+    env: "TaskEnv"
+    instance: "Instance"
+    policy: str
+    steps: int
+    waiting: bool
+    price: float
+
+
+class Subscriber:
+    """Is told what happens in an episode; does nothing unless overridden. It must leave the simulation as it found it."""
+
+    def on_start(self, frame: Frame) -> None:
+        """The instance is loaded, nothing has moved."""
+
+    def on_call(self, policy: str, call: Call) -> None:
+        """A policy was asked and answered (or failed to)."""
+
+    def on_step(self, frame: Frame) -> None:
+        """One control step was made."""
+
+    def on_end(self, outcome: Outcome) -> None:
+        """The episode is over, also after an error."""
+
+
+def episode_seed(instance_key: str, policy: str, repeat: int) -> tuple[int, ...]:
+    """What fixes an episode's chance (network delays, noise on actions): the instance, the policy and the repeat, never the order of episodes."""
+    return (*(int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") for text in (instance_key, policy)), repeat)
+
+
+def delay_steps(call: Call, remote: bool) -> int:
+    """Control steps that pass before the answer is there."""
+    steps = math.ceil(round(call.seconds * CONTROL_HZ, 6))  # rounded: 0.3 s is 6 steps, not 7 for 6.000000000000001
+    return steps if remote or steps > 1 else 0
+
+
+def run_episode(
+    env: "TaskEnv",
+    instance: "Instance",
+    driver: Driver,
+    fallback: Driver | None = None,
+    subscribers: Sequence[Subscriber] = (),
+    repeat: int = 0,
+    action_noise: float = 0.0,
+) -> Outcome:
+    """Let `driver` act until the task is done or the horizon is reached.
+
+    A failed call (deadline, outage, an answer of a wrong form) hands over to `fallback` for the rest of the episode; without one it ends the episode
+    as an error. So does any exception but a subscriber's, which passes through: a crash is never counted as a policy's failure.
+
+    Args:
+        env: holds `instance`, just loaded or restored.
+        repeat: number of this episode among those of the same policy on the same instance.
+        action_noise: standard deviation of Gaussian noise on the six motions of every action a policy makes, in units of action, >= 0. Without it an
+            episode differs from its repeat in the network's delays at most, and a local policy's not at all.
+
+    Returns:
+        the outcome. `calls` and `actions` are the driver's own; `price` and `seconds` contain the fallback's.
+    """
+    episode = _Episode(env, instance, subscribers, _Noise(action_noise, (*episode_seed(instance.key, driver.spec.name, repeat), 1)))
+    fallback_reason: str | None = None
+    error: str | None = None
+    try:
+        failure = episode.drive(driver, episode_seed(instance.key, driver.spec.name, repeat))
+        if failure is not None and fallback is not None:
+            fallback_reason = failure
+            failure = episode.drive(fallback, episode_seed(instance.key, fallback.spec.name, repeat))
+        error = None if failure is None else f"{episode.policy}: {failure}"
+    except Exception as problem:
+        if episode.telling:
+            raise  # a subscriber's trouble (a full disk) is none of the policy's
+        error = f"{episode.policy}: {type(problem).__name__}: {' '.join(str(problem).split())}"
+    outcome = episode.outcome(fallback_reason, error)
+    for subscriber in subscribers:
+        subscriber.on_end(outcome)
+    return outcome
+
+
+@dataclass
+class _Tally:
+    """What one driver has used up."""
+
+    spec: PolicySpec
+    calls: int = 0
+    actions: int = 0
+    megabytes: float = 0.0
+
+    @property
+    def price(self) -> float:
+        return self.spec.price.of(self.actions, self.calls, self.megabytes)
+
+
+class _Noise:
+    """What the arm makes of an action: the robot's own inaccuracy, which no policy sees coming. The gripper only opens and closes."""
+
+    def __init__(self, deviation: float, seed: tuple[int, ...]) -> None:
+        self._deviation, self._random = deviation, np.random.default_rng(seed)
+
+    def __call__(self, action: Actions) -> Actions:
+        if self._deviation == 0.0:
+            return action
+        action = action.copy()
+        action[:-1] += self._deviation * self._random.standard_normal(ACTION_DIM - 1)
+        return np.clip(action, -1.0, 1.0)
+
+
+class _Episode:
+    """The running state of one episode."""
+
+    def __init__(self, env: "TaskEnv", instance: "Instance", subscribers: Sequence[Subscriber], noise: _Noise) -> None:
+        self.env, self.instance, self.subscribers, self.noise = env, instance, subscribers, noise
+        self.policy = ""
+        self.tallies: list[_Tally] = []  # the driver's, then the fallback's
+        self.upload = self.inference = self.download = 0.0
+        self.telling = False  # a subscriber has the word
+
+    def drive(self, driver: Driver, seed: tuple[int, ...]) -> str | None:
+        """Let one policy act until the episode is over. Returns why a call of it failed, or None."""
+        spec = driver.spec
+        self.policy = spec.name
+        self.tallies.append(_Tally(spec))
+        if len(self.tallies) == 1:
+            frame = self._frame(waiting=False)
+            self._tell(lambda subscriber: subscriber.on_start(frame))
+        finish_chunk = spec.remote is not None and spec.remote.mode == "async"
+        rest = np.empty((0, ACTION_DIM), np.float32)  # actions of the old chunk still to be made while a call is answered
+        if isinstance(driver.caller, Privileged):
+            driver.caller.bind(self.env)
+        driver.caller.reset(self.instance.instruction, seed)
+        while not self.env.done:
+            call = driver.caller.call(self.env.observe(spec.cameras, spec.image_size))
+            self._count(call)
+            made = self._wait(delay_steps(call, spec.is_remote), rest if finish_chunk else rest[:0])
+            if call.actions is None:
+                return call.failure
+            stop = max(made, spec.execute)
+            for action in call.actions[made:stop]:
+                if not self.env.done:
+                    self._step(action)
+            rest = call.actions[stop:]
+        return None
+
+    def outcome(self, fallback: str | None, error: str | None) -> Outcome:
+        own = self.tallies[0] if self.tallies else None
+        return Outcome(
+            success=bool(self.env.success),
+            subgoals=float(self.env.subgoal_fraction),
+            steps=int(self.env.steps),
+            seconds=Seconds(self.upload, self.inference, self.download, self.env.steps / CONTROL_HZ),
+            calls=own.calls if own else 0,
+            actions=own.actions if own else 0,
+            price=sum((tally.price for tally in self.tallies), 0.0),
+            fallback=fallback,
+            error=error,
+        )
+
+    def _count(self, call: Call) -> None:
+        self.tallies[-1].calls += 1
+        self.tallies[-1].megabytes += call.megabytes
+        self.upload += call.upload
+        self.inference += call.inference
+        self.download += call.download
+        self._tell(lambda subscriber: subscriber.on_call(self.policy, call))
+
+    def _wait(self, steps: int, rest: Actions) -> int:
+        """Let `steps` control steps pass, making the actions of `rest` as far as they go. Returns how many of them were made."""
+        made = 0
+        for _ in range(steps):
+            if self.env.done:
+                break
+            if made < len(rest):
+                self._step(rest[made])
+                made += 1
+            else:
+                self._step(None)
+        return made
+
+    def _step(self, action: "Actions | None") -> None:
+        """One control step with an action of the policy, or holding still."""
+        self.env.advance(self.env.hold_action() if action is None else self.noise(action))
+        if action is not None:
+            self.tallies[-1].actions += 1
+        frame = self._frame(waiting=action is None)
+        self._tell(lambda subscriber: subscriber.on_step(frame))
+
+    def _tell(self, message: Callable[[Subscriber], None]) -> None:
+        self.telling = True
+        for subscriber in self.subscribers:
+            message(subscriber)
+        self.telling = False
+
+    def _frame(self, waiting: bool) -> Frame:
+        price = sum((tally.price for tally in self.tallies), 0.0)
+        return Frame(self.env, self.instance, self.policy, self.env.steps, waiting, price)

@@ -1,0 +1,244 @@
+"""One instance with one policy, looked at closely: what it saw, what it did, how it ended (`python -m osel_sim.doctor --policy FILE`)."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.core import content
+from osel_sim.core.errors import UsageError
+from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
+from osel_sim.formats import library
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.call import Call, Caller, Privileged
+from osel_sim.interface.outcome import Outcome
+from osel_sim.interface.policy import ACTION_DIM, Observation
+from osel_sim.policy.mapping import state_of
+
+AXES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+OTHER_INSTRUCTION = "leave everything as it is"
+SATURATED, STILL, TINY, FAR = 0.999, 1e-4, 0.02, 8.0
+FLAT_IMAGE = 4.0
+"""Standard deviation (of 255) below which an image shows nothing."""
+PROBLEM, NOTE = "problem", "note"
+
+
+@dataclass
+class Report:
+    """What was found.
+
+    Attributes:
+        instance, instruction: what was tried.
+        inputs: name of each input as the policy knows it -> what it was at the first call, in words.
+        pictures: files with what each camera showed at the first, a middle and the last call.
+        calls, chunk: how often it was asked, and how many actions its answers held.
+        actions: axis -> lowest, mean, highest, standard deviation and share at the limit, of all actions answered.
+        outcome: how it ended.
+        findings: (`problem` or `note`, in words).
+    """
+
+    policy: str
+    instance: str
+    instruction: str
+    inputs: dict[str, str] = field(default_factory=dict)
+    pictures: list[str] = field(default_factory=list)
+    calls: int = 0
+    chunk: tuple[int, int] = (0, 0)
+    actions: dict[str, dict[str, float]] = field(default_factory=dict)
+    outcome: dict[str, Any] = field(default_factory=dict)
+    findings: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def sound(self) -> bool:
+        """Whether nothing is wrong with how the policy is connected; it may fail the task all the same."""
+        return all(kind != PROBLEM for kind, _ in self.findings)
+
+
+class Watched:
+    """A caller that remembers what went through it."""
+
+    def __init__(self, caller: Caller) -> None:
+        self._caller = caller
+        self.seen: list[tuple[Observation, Call]] = []
+
+    def bind(self, env: Any) -> None:
+        """Show the world to a caller that wants to see it."""
+        if isinstance(self._caller, Privileged):
+            self._caller.bind(env)
+
+    def reset(self, instruction: str, seed: tuple[int, ...]) -> None:
+        """As the caller."""
+        self._caller.reset(instruction, seed)
+
+    def call(self, observation: Observation) -> Call:
+        """As the caller."""
+        answer = self._caller.call(observation)
+        self.seen.append((observation, answer))
+        return answer
+
+    def close(self) -> None:
+        """As the caller."""
+        self._caller.close()
+
+
+class _OtherInstruction(Subscriber):
+    """Asks once, before the episode, what the policy would do if it were told something else."""
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self.answer: Call | None = None
+
+    @override
+    def on_start(self, frame: Frame) -> None:
+        spec, caller = self._driver.spec, self._driver.caller
+        if not spec.is_privileged:
+            caller.reset(OTHER_INSTRUCTION, (0,))
+            self.answer = caller.call({**frame.env.observe(spec.cameras, spec.image_size), "task": OTHER_INSTRUCTION})
+
+
+def find_policy(policy: str, folder: Path | None) -> tuple[PolicySpec, Path | None]:
+    """A policy by name, or by its file; and the folder in which its fallback is looked for.
+
+    Raises:
+        UsageError: there is none.
+        ContentError: its file is wrong.
+    """
+    from osel_sim.formats.policy_file import load_policy_file
+
+    if not policy.endswith(".toml"):
+        return library.load_policy(policy, folder), folder
+    file = Path(policy)
+    if not file.is_file():
+        raise UsageError(f"{policy}: there is no such policy file")
+    return load_policy_file(file.resolve()), file.resolve().parent
+
+
+def check_policy(spec: PolicySpec, task: str, seed: int, level: int, out: Path, tasks: Path | None = None, policies: Path | None = None) -> Report:
+    """Let a policy act on one test instance, without its fallback, and look at everything that went in and out.
+
+    Args:
+        out: folder for pictures and `report.json`.
+        tasks, policies: folders of the user's own files.
+
+    Raises:
+        OselError: the policy does not load, its file is wrong, or its server cannot be reached.
+    """
+    from osel_sim.episodes.drivers import Drivers
+    from osel_sim.formats.task_file import load_task_file
+    from osel_sim.sim.env import TaskEnv
+    from osel_sim.sim.instance import make_instance
+
+    task_spec = load_task_file(content.find("tasks", task, tasks))
+    instance = make_instance(task_spec, seed, level, "test")
+    report = Report(spec.name, instance.key, instance.instruction)
+    with Drivers([spec]) as drivers:
+        watched = Watched(drivers[spec.name].caller)
+        env = TaskEnv(task_spec)
+        try:
+            env.load(instance)
+            other = _OtherInstruction(drivers[spec.name])
+            outcome = run_episode(env, instance, Driver(spec, watched), subscribers=[other])
+        finally:
+            env.close()
+    out.mkdir(parents=True, exist_ok=True)
+    report.calls = len(watched.seen)
+    report.outcome = asdict(outcome)
+    if watched.seen:
+        _inputs(report, spec, watched.seen[0][0])
+        report.pictures = _pictures(spec, [observation for observation, _ in watched.seen], out)
+    _actions(report, [call.actions for _, call in watched.seen if call.actions is not None], other.answer)
+    _end(report, outcome)
+    partial = out / "report.json.partial"
+    partial.write_text(json.dumps(asdict(report), indent=2) + "\n")
+    partial.replace(out / "report.json")
+    return report
+
+
+def _inputs(report: Report, spec: PolicySpec, first: Observation) -> None:
+    for camera in spec.cameras:
+        image: NDArray[np.uint8] = first[f"observation.images.{camera}"]
+        size = " x ".join(map(str, image.shape[:2]))
+        report.inputs[spec.mapping.key(camera)] = f"camera {camera}, {size} pixels, brightness {image.mean():.0f} of 255, contrast {image.std():.0f}"
+        if image.std() < FLAT_IMAGE:
+            report.findings.append((PROBLEM, f"the image of {camera} is of one colour"))
+    for key in spec.mapping.blank:
+        report.inputs[key] = "black"
+    if spec.mapping.state:
+        state = state_of(first, spec.mapping)
+        report.inputs[spec.mapping.state] = f"{', '.join(spec.mapping.state_parts)}: {np.array2string(state, precision=3, suppress_small=True)}"
+        report.findings += [(NOTE, text) for text in _far_off(spec, state)]
+    report.inputs[spec.mapping.prompt] = repr(report.instruction)
+
+
+def _far_off(spec: PolicySpec, state: NDArray[np.float32]) -> list[str]:
+    """Numbers of the state that are far from all that a local checkpoint was trained on."""
+    from safetensors.numpy import load_file
+
+    folder = content.resolve_checkpoint(spec.checkpoint) if spec.checkpoint else None
+    for file in sorted(folder.glob("policy_preprocessor*normalizer*.safetensors")) if isinstance(folder, Path) else []:
+        statistics = load_file(file)
+        mean, spread = (statistics.get(f"observation.state.{key}") for key in ("mean", "std"))
+        if mean is not None and spread is not None and mean.shape == state.shape:
+            away = np.abs(state - mean) / np.maximum(spread, 1e-6)
+            worst = int(away.argmax())
+            if away[worst] > FAR:
+                return [
+                    f"number {worst} of the state, {state[worst]:.3f}, is {away[worst]:.0f} standard deviations from the mean {mean[worst]:.3f} "
+                    "of what the checkpoint was trained on: do [mapping] state_parts and the robot's starting pose agree with it?"
+                ]
+    return []
+
+
+def _pictures(spec: PolicySpec, observations: list[Observation], out: Path) -> list[str]:
+    """Write what the cameras showed at the first, a middle and the last call."""
+    import imageio.v3 as imageio
+
+    files = []
+    for index in sorted({0, len(observations) // 2, len(observations) - 1}):
+        for camera in spec.cameras:
+            file = out / f"call{index:03d}_{camera}.png"
+            imageio.imwrite(file, observations[index][f"observation.images.{camera}"])
+            files.append(str(file))
+    return files
+
+
+def _actions(report: Report, chunks: list[NDArray[np.float32]], other: Call | None) -> None:
+    if not chunks:
+        return
+    lengths = [len(chunk) for chunk in chunks]
+    report.chunk = (min(lengths), max(lengths))
+    actions = np.concatenate(chunks)
+    limit = np.abs(actions) >= SATURATED
+    for index, axis in enumerate(AXES[:ACTION_DIM]):
+        column = actions[:, index]
+        report.actions[axis] = {
+            "min": float(column.min()),
+            "mean": float(column.mean()),
+            "max": float(column.max()),
+            "std": float(column.std()),
+            "at_limit": float(limit[:, index].mean()),
+        }
+    motions, found = actions[:, :6], report.findings
+    if (motions.std(axis=0) < STILL).all():
+        found.append((PROBLEM, "all its motions are the same from beginning to end: it does not react to what it sees"))
+    elif (np.abs(motions[:, :3]) < TINY).all():
+        found.append((PROBLEM, f"its motions are all below {TINY}: are they metres a step? then [mapping] scale = [20, 20, 20, 2, 2, 2]"))
+    if limit[:, :3].mean() > 0.7:
+        found.append(
+            (PROBLEM, f"{limit[:, :3].mean():.0%} of its motions are at the limit: [mapping] scale or the statistics of its actions are wrong")
+        )
+    if (actions[:, 6] > 0).all() or (actions[:, 6] <= 0).all():
+        word = "closed" if actions[0, 6] > 0 else "open"
+        found.append((NOTE, f"the gripper is told to be {word} from beginning to end; [mapping] gripper says what its number means"))
+    if other is not None and other.actions is not None and np.array_equal(other.actions, chunks[0]):
+        found.append((PROBLEM, "another instruction about the same scene gives the very same actions: it does not read the instruction"))
+
+
+def _end(report: Report, outcome: Outcome) -> None:
+    if outcome.error is not None:
+        report.findings.append((PROBLEM, f"the episode ended as an error: {outcome.error}"))
+    elif not outcome.success:
+        report.findings.append((NOTE, f"the task was not done within {outcome.steps} steps; {outcome.subgoals:.0%} of its subgoals were reached"))

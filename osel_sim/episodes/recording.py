@@ -1,0 +1,93 @@
+"""A recording in its folder: what is there of a plan, what is missing, and how it becomes a rollout log."""
+
+from pathlib import Path
+from typing import Any
+
+from osel_sim.context.cache import ContextCache
+from osel_sim.episodes.workers import Episode, Plan, Recorded
+from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts, write_rollouts
+from osel_sim.formats.shards import SHARDS, Shards
+from osel_sim.selection.skills import Skills
+
+
+class Recording:
+    """What a folder holds of a plan: in its rollout log and contexts if it has those already, and in the shards beside them.
+
+    Args:
+        encoder: identity of the one whose contexts are wanted.
+        skills: what the policies declare; kept with the log.
+
+    Attributes:
+        grew: something was added.
+    """
+
+    def __init__(self, folder: Path, plan: Plan, encoder: str, skills: Skills | None = None) -> None:
+        self.folder, self.plan, self.encoder, self.grew = folder, plan, encoder, False
+        self._skills = skills
+        self._cache = ContextCache(folder, autosave=0)
+        self._rows: dict[str, dict[Episode, Row]] = {}
+        there, metadata = read_rollouts(folder) if (folder / ROLLOUTS).exists() else ([], {})
+        self._declared, self._default = metadata.get(DECLARED), metadata.get("encoder")
+        for row in there:
+            self._rows.setdefault(row.instance, {})[row.policy, row.repeat] = row
+        self._shards = Shards(folder) if (folder / SHARDS).exists() else None
+        if self._shards is not None:
+            for instance, rows in self._shards.rows.items():
+                self._rows.setdefault(instance, {}).update(rows)
+
+    @property
+    def complete(self) -> bool:
+        """The rollout log and its contexts hold everything, and the contexts it is read with are this encoder's."""
+        return self._shards is None and self._default == self.encoder and not self.missing() and self._has_skills()
+
+    def missing(self) -> dict[str, list[Episode]]:
+        """Episodes that are not there, by instance; an instance that lacks only its context has none."""
+        result = {}
+        for instance in self.plan.instances:
+            there = self._rows.get(instance, {})
+            episodes = [episode for episode in self.plan.episodes(instance) if episode not in there]
+            if episodes or not self._has_context(instance):
+                result[instance] = episodes
+        return result
+
+    def add(self, recorded: Recorded) -> list[Row]:
+        """Take in an instance, and wait until it is on disk. Returns its new rows in the plan's order."""
+        rows = [recorded.rows[episode] for episode in self.plan.episodes(recorded.instance) if episode in recorded.rows]
+        if self._shards is None:
+            self._shards = Shards(self.folder)
+        self._shards.add(recorded.instance, rows, self.encoder, recorded.context)
+        self._rows.setdefault(recorded.instance, {}).update(recorded.rows)
+        self.grew = True
+        return rows
+
+    def finish(self, configuration: dict[str, Any]) -> None:
+        """Turn what is there into the rollout log and its contexts.
+
+        Args:
+            configuration: goes into the log's metadata.
+        """
+        shards = self._shards or Shards(self.folder)
+        for encoder, contexts in shards.contexts.items():
+            for instance, context in contexts.items():
+                self._cache.put(encoder, instance, context)
+        if self._skills is not None:
+            for skill, examples in self._skills.examples.items():
+                self._cache.put_examples(self.encoder, skill, list(examples))
+            configuration = configuration | {DECLARED: self._able}
+        self._cache.save()
+        write_rollouts(self.folder, [self._rows[key][episode] for key in self.plan.instances for episode in self.plan.episodes(key)], configuration)
+        shards.close(remove=True)
+        self._shards = None
+
+    @property
+    def _able(self) -> dict[str, list[str]] | None:
+        """What is declared, as it lies in the log's metadata."""
+        return None if self._skills is None else {policy: list(names) for policy, names in self._skills.able.items()}
+
+    def _has_skills(self) -> bool:
+        there = self._cache.skills(self.encoder)
+        return self._declared == self._able and (self._skills is None or set(self._skills.examples) <= set(there))
+
+    def _has_context(self, instance: str) -> bool:
+        in_shards = self._shards is not None and instance in self._shards.contexts.get(self.encoder, {})
+        return in_shards or self._cache.get(self.encoder, instance) is not None

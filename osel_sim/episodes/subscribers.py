@@ -1,0 +1,50 @@
+"""Listeners of the episode loop that measure or pace it; the video has a file of its own."""
+
+import time
+from typing import override
+
+from osel_sim.episodes.loop import Frame, Subscriber
+from osel_sim.interface.call import Call
+from osel_sim.interface.outcome import Outcome
+from osel_sim.interface.policy import CONTROL_HZ
+
+
+class Timing(Subscriber):
+    """What an episode really took on this machine. Goes into `timing.jsonl`, never into the journal.
+
+    Attributes:
+        calls: seconds of each call of a policy, in order.
+        seconds: of the whole episode.
+    """
+
+    def __init__(self) -> None:
+        self.calls: list[float] = []
+        self.seconds = 0.0
+        self._start = time.perf_counter()
+
+    @override
+    def on_start(self, frame: Frame) -> None:
+        self._start = time.perf_counter()
+
+    @override
+    def on_call(self, policy: str, call: Call) -> None:
+        self.calls.append(call.measured_seconds)
+
+    @override
+    def on_end(self, outcome: Outcome) -> None:
+        self.seconds = time.perf_counter() - self._start
+
+
+class RealTime(Subscriber):
+    """Sleeps so that control steps happen at 20 Hz, waits included. A machine that cannot keep up simply runs late."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+
+    @override
+    def on_start(self, frame: Frame) -> None:
+        self._start = time.perf_counter() - frame.steps / CONTROL_HZ
+
+    @override
+    def on_step(self, frame: Frame) -> None:
+        time.sleep(max(0.0, self._start + frame.steps / CONTROL_HZ - time.perf_counter()))

@@ -1,0 +1,1 @@
+"""What things are: protocols and small frozen dataclasses that import nothing heavy."""

@@ -1,0 +1,65 @@
+"""What a selector is: it chooses a policy for a context and learns from the reward of that choice alone."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.core.errors import UnknownNameError, UsageError
+
+Context = NDArray[np.float32]
+"""An instance's context: float32 (context_dim,), finite."""
+
+State = dict[str, Any]
+"""A selector's whole state: numpy arrays and values that JSON can hold, by name. `osel_sim.selection.state` writes it to disk."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a selector decided for one context.
+
+    Attributes:
+        policy: the chosen policy.
+        propensities: probability with which each policy (all of them) would have been chosen; they sum to 1.
+        details: what the selector wants back with `update` (PPO: its value estimate and log probability). Lets several choices be in flight at once.
+    """
+
+    policy: str
+    propensities: dict[str, float]
+    details: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.policy not in self.propensities:
+            raise UnknownNameError("policy", self.policy, self.propensities, "the propensities of this choice")
+        total = math.fsum(self.propensities.values())
+        if not abs(total - 1.0) < 1e-6 or min(self.propensities.values()) < 0.0:
+            raise UsageError(f"propensities must be >= 0 and sum to 1, got {self.propensities}")
+
+
+class Selector(Protocol):
+    """Chooses among `policies`. `select` and `update` alternate, or lag behind each other where episodes run at once."""
+
+    policies: tuple[str, ...]
+
+    def select(self, context: Context) -> Choice:
+        """Choose a policy for an instance."""
+        ...
+
+    def update(self, context: Context, choice: Choice, reward: float) -> None:
+        """Learn from the reward of an earlier choice for this context."""
+        ...
+
+    def state_dict(self) -> State:
+        """Everything that decides what comes next, random state included: load it, go on, and the result is bit-identical to not having stopped."""
+        ...
+
+    def load_state_dict(self, state: State) -> None:
+        """Take over a state of a selector of the same kind, policies and settings."""
+        ...
+
+    def add_policy(self, name: str) -> None:
+        """Make one more policy available; what was learned of the others stays."""
+        ...

@@ -1,0 +1,125 @@
+"""Checks that all selectors share."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.interface.selector import Choice, Context, State
+
+
+class SelectorBase(ABC):
+    """Checks that all selectors share. One overrides `_select`, `_update`, `_state`, `_load` and, where it keeps numbers by policy, `_add_policy`.
+
+    Args:
+        policies: names to choose from, each once.
+        context_dim: length of a context.
+        seed: of everything random in the selector, in [0, 2**32).
+
+    Raises:
+        UsageError: no policies, one named twice, or a number out of range.
+    """
+
+    name: ClassVar[str]
+    off_policy: ClassVar[bool] = False
+    """Whether it may learn from outcomes of choices that it did not make itself, such as those of a log."""
+
+    def __init__(self, policies: Sequence[str], context_dim: int, seed: int) -> None:
+        self.policies = tuple(policies)
+        if not self.policies or len(set(self.policies)) < len(self.policies):
+            raise UsageError(f"a selector needs at least one policy, each named once, got {list(self.policies)}")
+        if context_dim < 1:
+            raise UsageError(f"context_dim must be at least 1, got {context_dim}")
+        if not 0 <= seed < 2**32:
+            raise UsageError(f"seed must lie in [0, 2**32), got {seed}")
+        self.context_dim = context_dim
+        self.seed = seed
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Hyper-parameters (JSON values); a state is only taken over by a selector of equal settings."""
+        return {}
+
+    def select(self, context: Context) -> Choice:
+        """Choose a policy for an instance.
+
+        Args:
+            context: float32 (context_dim,).
+
+        Raises:
+            UsageError: wrong shape or type, or not finite.
+        """
+        self._check_context(context)
+        return self._select(context)
+
+    def update(self, context: Context, choice: Choice, reward: float) -> None:
+        """Learn from the reward of an earlier choice for this context.
+
+        Raises:
+            UsageError: a context of the wrong form or a reward that is not finite.
+            UnknownNameError: the choice is of a policy this selector does not have.
+        """
+        self._check_context(context)
+        if choice.policy not in self.policies:
+            raise UnknownNameError("policy", choice.policy, self.policies, "the policies of this selector")
+        if not math.isfinite(reward):
+            raise UsageError(f"a reward must be finite, got {reward}; an episode that ended in error has none")
+        self._update(context, choice, float(reward))
+
+    def state_dict(self) -> State:
+        """The whole state, as `Selector.state_dict` promises. Arrays are copies."""
+        return {**self._header(), **self._state()}
+
+    def load_state_dict(self, state: State) -> None:
+        """Take over a state.
+
+        Raises:
+            DataError: it belongs to another kind of selector, other policies or settings, or lacks something.
+        """
+        for key, mine in self._header().items():
+            if state.get(key) != mine:
+                raise DataError(f"selector state: {key} is {state.get(key)!r}, but this selector has {mine!r}")
+        try:
+            self._load(state)
+        except (KeyError, ValueError, RuntimeError, TypeError) as error:
+            raise DataError(f"selector state is incomplete or damaged ({type(error).__name__}: {error})") from None
+
+    def add_policy(self, name: str) -> None:
+        """Make one more policy available, as the last of `policies`.
+
+        Raises:
+            UsageError: it is there already.
+        """
+        if name in self.policies:
+            raise UsageError(f"policy {name!r} is already among {', '.join(self.policies)}")
+        self._add_policy(name)
+        self.policies = (*self.policies, name)
+
+    def _header(self) -> State:
+        return {"selector": self.name, "policies": list(self.policies), "context_dim": self.context_dim, "settings": self.settings}
+
+    def _check_context(self, context: Context) -> None:
+        if not isinstance(context, np.ndarray) or context.shape != (self.context_dim,) or context.dtype != np.float32:
+            got = f"{context.dtype} {context.shape}" if isinstance(context, np.ndarray) else type(context).__name__
+            raise UsageError(f"a context must be a float32 array ({self.context_dim},), got {got}")
+        if not np.isfinite(context).all():
+            raise UsageError("a context must be finite, got NaN or infinity")
+
+    @abstractmethod
+    def _select(self, context: Context) -> Choice: ...
+
+    @abstractmethod
+    def _update(self, context: Context, choice: Choice, reward: float) -> None: ...
+
+    @abstractmethod
+    def _state(self) -> State: ...
+
+    @abstractmethod
+    def _load(self, state: State) -> None: ...
+
+    def _add_policy(self, name: str) -> None:
+        """Called before the name joins `policies`."""
+        return None

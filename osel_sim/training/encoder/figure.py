@@ -1,0 +1,78 @@
+"""t-SNE picture of contexts: `python -m osel_sim.training.encoder.figure --data DIR --out docs/context_tsne.png`."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from osel_sim.context.encoder import DEFAULT_ENCODER, encode_many, load_encoder
+from osel_sim.core.content import find
+from osel_sim.core.errors import OselError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Draw the contexts of unseen test instances, coloured by object, container and phrasing."""
+    parser = argparse.ArgumentParser(prog="python -m osel_sim.training.encoder.figure", description=__doc__)
+    parser.add_argument("--data", type=Path, required=True, metavar="DIR", help="rendered scenes are kept here, and rendered if missing")
+    parser.add_argument("--out", type=Path, required=True, metavar="PNG")
+    parser.add_argument("--encoder", default=DEFAULT_ENCODER)
+    parser.add_argument("--task", default="pick_place")
+    parser.add_argument("--instances", type=int, default=600, help="test instances (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    try:
+        draw(options.encoder, options.task, options.data, options.out, options.instances)
+    except OselError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def draw(encoder_name: str, task_name: str, data: Path, out: Path, count: int) -> None:
+    """Encode `count` test instances, lay them out with t-SNE, and write the picture with the neighbour agreement in each title."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from sklearn.manifold import TSNE
+
+    from osel_sim.formats.task_file import load_task_file
+    from osel_sim.training.encoder.evaluate import chance, context_labels, neighbour_agreement
+    from osel_sim.training.encoder.scenes import cached_scenes
+
+    encoder, task = load_encoder(encoder_name), load_task_file(find("tasks", task_name))
+    scenes = cached_scenes(data, task, count, "test", encoder.image_size)
+    contexts = encode_many(encoder, [([image], text) for image, text in zip(scenes.images, scenes.instructions.tolist(), strict=True)])
+    labels = context_labels(task, scenes)
+    asked = np.char.add(labels["object"], labels["container"])
+    means = {value: contexts[asked == value].mean(axis=0) for value in np.unique(asked)}
+    residues = contexts[:, encoder.dimension // 2 :] - np.stack([means[value] for value in asked])[:, encoder.dimension // 2 :]
+    points, residue_points = (TSNE(perplexity=30, init="pca", random_state=0).fit_transform(vectors) for vectors in (contexts, residues))
+    panels = (
+        ("object", "contexts by object", contexts, points),
+        ("container", "contexts by container", contexts, points),
+        ("phrasing", "contexts by phrasing", contexts, points),
+        ("phrasing", "text part by phrasing, mean of its object and container taken off", residues, residue_points),
+    )
+    figure, axes = plt.subplots(2, 2, figsize=(14, 14))
+    for axis, (name, title, vectors, places) in zip(axes.flat, panels, strict=True):
+        for index, value in enumerate(np.unique(labels[name])):
+            chosen = labels[name] == value
+            marker = "x" if str(value).startswith("held_out") else "o"
+            axis.scatter(*places[chosen].T, s=14, marker=marker, color=plt.get_cmap("tab20")(index % 20), label=str(value).replace("_", " "))
+        axis.set_title(
+            f"{title}\n{neighbour_agreement(vectors, labels[name]):.0%} of the 10 nearest agree ({chance(labels[name]):.0%} by chance)", fontsize=10
+        )
+        axis.legend(fontsize=7, ncols=7, loc="upper center", bbox_to_anchor=(0.5, -0.01), frameon=False)
+        axis.set_xticks([])
+        axis.set_yticks([])
+    figure.suptitle(f"Contexts of {count} unseen {task.name} instances, encoder {encoder_name} (t-SNE)")
+    figure.tight_layout()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(out, dpi=70)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

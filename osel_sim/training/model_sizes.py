@@ -1,0 +1,100 @@
+"""Sizes of the models that are trained here: what the `[model]` table of a recipe may say.
+
+What a recipe leaves out is as the type's configuration has it (ACT's perception: PerceptionConfig).
+"""
+
+from typing import Annotated, Literal, Required, TypedDict
+
+from pydantic import Discriminator, with_config
+
+from osel_sim.formats.toml_types import TABLE, between
+
+
+class _Chunk(TypedDict, total=False):
+    chunk_size: Annotated[int, between(1, 200)]
+    """Actions predicted at once, at 20 Hz."""
+    image_size: Annotated[int, between(16, 512)]
+    """Images are brought to this square size (pixels)."""
+
+
+class _Perception(_Chunk, total=False):
+    stem_channels: Annotated[int, between(4, 512)]
+    """Width of the first convolution (half resolution)."""
+    channels: Annotated[int, between(8, 1024)]
+    """Width of the other convolutions (quarter resolution)."""
+    trunk_layers: Annotated[int, between(0, 16)]
+    """Residual convolutions at quarter resolution that no text reaches."""
+    query_dim: Annotated[int, between(4, 1024)]
+    """Width of the space in which a word meets a place in the image."""
+    queries: Annotated[int, between(1, 16)]
+    """How many things of an instruction are looked for, in the order of the task's roles."""
+    vocabulary: Annotated[int, between(64, 1_000_000)]
+    """Hashed tokens."""
+    text_length: Annotated[int, between(4, 256)]
+    """Words of an instruction that are kept."""
+    text_dim: Annotated[int, between(8, 1024)]
+    """Embedding width of a word."""
+    text_layers: Annotated[int, between(0, 12)]
+    """Self-attention layers over the words."""
+
+
+class _Head(_Perception, total=False):
+    hidden: Annotated[int, between(16, 8192)]
+    """Width of the action head."""
+    hidden_layers: Annotated[int, between(0, 32)]
+    """Residual blocks of the action head."""
+
+
+@with_config(TABLE)
+class LanguageChunk(_Head, total=False):
+    """Sizes of a `language_chunk`."""
+
+    keypoints: Annotated[int, between(1, 512)]
+    """Spatial-softmax points a camera, on features modulated by the instruction."""
+    type: Required[Literal["language_chunk"]]
+    """The convolutional policy of this package."""
+
+
+@with_config(TABLE)
+class OctoChunk(_Head, total=False):
+    """Sizes of an `octo_chunk`."""
+
+    patch: Annotated[int, between(1, 64)]
+    """Side of an image patch, in cells of the quarter-resolution map; each patch is one token."""
+    width: Annotated[int, between(16, 4096)]
+    """Width of the transformer."""
+    layers: Annotated[int, between(1, 48)]
+    """Layers of the transformer."""
+    attention_heads: Annotated[int, between(1, 64)]
+    """Attention heads of the transformer."""
+    readouts: Annotated[int, between(1, 64)]
+    """Tokens whose outputs go to the action head, besides the two that find what is to be handled now."""
+    integration_steps: Annotated[int, between(1, 100)]
+    """Euler steps from noise to actions."""
+    flow_samples: Annotated[int, between(1, 64)]
+    """Noise levels tried for each training sample."""
+    type: Required[Literal["octo_chunk"]]
+    """The Octo-style transformer of this package."""
+
+
+@with_config(TABLE)
+class Act(_Perception, total=False):
+    """Sizes of an `act`."""
+
+    keypoints: Annotated[int, between(1, 512)]
+    """Spatial-softmax points a camera, on features modulated by the instruction."""
+    dim_model: Annotated[int, between(16, 4096)]
+    """Width of the transformer."""
+    n_heads: Annotated[int, between(1, 64)]
+    """Attention heads."""
+    dim_feedforward: Annotated[int, between(16, 16384)]
+    """Width of the feed-forward blocks."""
+    n_encoder_layers: Annotated[int, between(1, 48)]
+    """Layers of the encoder."""
+    n_decoder_layers: Annotated[int, between(1, 48)]
+    """Layers of the decoder."""
+    type: Required[Literal["act"]]
+    """LeRobot's ACT, on a perception of this package."""
+
+
+ModelSizes = Annotated[LanguageChunk | OctoChunk | Act, Discriminator("type")]
