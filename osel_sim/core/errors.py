@@ -55,7 +55,12 @@ class DataError(OselError):
     """A journal, rollout log or dataset cannot be read or does not have the promised form."""
 
 
+def nearest(name: str, known: Iterable[str], likeness: float = 0.5) -> str | None:
+    """The known name that is most like `name`, or None where none is as like it as `likeness`, in [0, 1]."""
+    return next(iter(difflib.get_close_matches(name, list(known), n=1, cutoff=likeness)), None)
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """`did you mean 'x'? `, or nothing where nothing is near."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f"did you mean {near[0]!r}? " if near else ""
+    near = nearest(name, known)
+    return f"did you mean {near!r}? " if near is not None else ""

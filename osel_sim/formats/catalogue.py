@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +12,7 @@ from pydantic_core import PydanticKnownError
 
 from osel_sim.formats.terms import KINDS
 from osel_sim.formats.toml_file import load_toml
-from osel_sim.formats.toml_types import TABLE, Number, Texts, Version, between, refuse, shown, unknown_value
+from osel_sim.formats.toml_types import TABLE, Faults, Number, Texts, Version, between, refuse, shown, unknown_value
 
 _EXTENTS = {"box": 3, "cylinder": 2}
 """Models that are built from their size, and how many numbers that has."""
@@ -116,21 +116,21 @@ class CatalogueFile:
 
     version: Version
     """Of the format."""
-    attribute: dict[str, Attribute] = Field(default_factory=dict)
+    attribute: dict[str, Attribute] = dataclasses.field(default_factory=dict)
     """Properties by name."""
-    object: dict[str, Thing] = Field(default_factory=dict)
+    object: dict[str, Thing] = dataclasses.field(default_factory=dict)
     """Things that lie loose."""
-    container: dict[str, Receptacle] = Field(default_factory=dict)
+    container: dict[str, Receptacle] = dataclasses.field(default_factory=dict)
     """Things that objects are put into."""
-    zone: dict[str, Receptacle] = Field(default_factory=dict)
+    zone: dict[str, Receptacle] = dataclasses.field(default_factory=dict)
     """Marks on the table that objects are put or pushed onto."""
-    peg: dict[str, Receptacle] = Field(default_factory=dict)
+    peg: dict[str, Receptacle] = dataclasses.field(default_factory=dict)
     """Pegs that nuts are put around."""
-    drawer: dict[str, Drawer] = Field(default_factory=dict)
+    drawer: dict[str, Drawer] = dataclasses.field(default_factory=dict)
     """Drawers."""
-    button: dict[str, Button] = Field(default_factory=dict)
+    button: dict[str, Button] = dataclasses.field(default_factory=dict)
     """Buttons."""
-    door: dict[str, Door] = Field(default_factory=dict)
+    door: dict[str, Door] = dataclasses.field(default_factory=dict)
     """Doors."""
 
     @field_validator(*KINDS)
@@ -141,11 +141,11 @@ class CatalogueFile:
         return things
 
 
-def _faults(things: Mapping[str, Thing], before: Mapping[str, Mapping[str, object]]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+def _faults(things: Mapping[str, Thing], before: Mapping[str, Mapping[str, object]]) -> Faults:
     for name, thing in things.items():
         for kind in KINDS:
             if name in before.get(kind, ()):
-                yield (name,), f"is the name of a {kind} already"
+                yield (name,), f"is a name in [{kind}] already"
         for index, attribute in enumerate(thing.attributes):
             if "attribute" in before and attribute not in before["attribute"]:
                 yield (name, "attributes", index), unknown_value(attribute, before["attribute"])

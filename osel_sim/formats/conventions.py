@@ -1,13 +1,13 @@
 """The `[mapping]` table of a policy file: what a policy trained elsewhere calls its inputs, and what its numbers mean."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated
 
 from pydantic import AfterValidator
 from pydantic.dataclasses import dataclass
 
-from osel_sim.formats.toml_types import TABLE, Number, OneOf, Switch, Texts, between, shown, unknown_value
+from osel_sim.formats.toml_types import TABLE, Faults, Number, OneOf, Switch, Texts, between, shown, unknown_value
 
 STATE_PARTS = {"position": 3, "axis_angle": 3, "quaternion": 4, "euler": 3, "fingers": 2, "gripper": 1}
 """What a state can be put together from, and how many numbers each has: gripper position (metres, world); its orientation as axis-angle, quaternion
@@ -62,7 +62,7 @@ class Conventions:
         """What the policy calls a camera's image."""
         return self.images.get(camera, f"observation.images.{camera}")
 
-    def faults(self, cameras: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], str]]:
+    def faults(self, cameras: tuple[str, ...]) -> Faults:
         """What does not fit the cameras of a policy: (keys within the table, problem)."""
         for camera in self.images:
             if camera not in cameras:

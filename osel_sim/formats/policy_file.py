@@ -1,6 +1,6 @@
 """A policy file: what drives the robot, where it runs, what it needs to see, what it costs."""
 
-from dataclasses import fields
+from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -62,7 +62,7 @@ class Remote:
 
 
 @dataclass(frozen=True, config=TABLE)
-class Observation:
+class ObservationTable:
     """What a policy is shown."""
 
     cameras: tuple[Annotated[str, OneOf(CAMERAS)], ...]
@@ -96,7 +96,7 @@ class _Keys:
     """Declared time of one inference on the virtual clock."""
     skills: Texts | None = None
     """Tasks that it was made for (names, `tag:TAG` or `all`), for selectors that want to know; left out: nothing is said."""
-    price: Price = Field(default_factory=Price)
+    price: Price = field(default_factory=Price)
     """What it costs; left out: nothing."""
 
     @field_validator("skills")
@@ -120,7 +120,7 @@ class PolicySpec(_Keys):
     cameras: tuple[str, ...]
     image_size: int
     remote: Remote | None
-    mapping: Conventions = Field(default_factory=Conventions)
+    mapping: Conventions = field(default_factory=Conventions)
     file: Path
     version: int = 1
 
@@ -143,11 +143,11 @@ class PolicyFile(_Keys):
     """Of the format."""
     location: Annotated[str, OneOf(("local", "remote"))]
     """Where it runs: on the robot, or behind a server."""
-    observation: Annotated[Observation | None, Field(validate_default=True)] = None
+    observation: Annotated[ObservationTable | None, Field(validate_default=True)] = None
     """What it is shown; only a privileged policy needs no such table."""
     remote: Annotated[Remote | None, Field(validate_default=True)] = None
     """How it is reached, where `location` is remote."""
-    mapping: Conventions = Field(default_factory=Conventions)
+    mapping: Conventions = field(default_factory=Conventions)
     """Which names and conventions of the policy are others than those of this package."""
 
     @field_validator("location")
@@ -160,7 +160,7 @@ class PolicyFile(_Keys):
 
     @field_validator("observation")
     @classmethod
-    def _sees_something(cls, observation: Observation | None, info: ValidationInfo) -> Observation | None:
+    def _sees_something(cls, observation: ObservationTable | None, info: ValidationInfo) -> ObservationTable | None:
         if info.data.get("kind", PRIVILEGED[0]) in PRIVILEGED:
             return observation
         if observation is None:
@@ -183,14 +183,14 @@ class PolicyFile(_Keys):
     @classmethod
     def _fits_the_cameras(cls, mapping: Conventions, info: ValidationInfo) -> Conventions:
         observation = info.data.get("observation")
-        if isinstance(observation, Observation) and (faults := list(mapping.faults(observation.cameras))):
+        if isinstance(observation, ObservationTable) and (faults := list(mapping.faults(observation.cameras))):
             refuse(*faults)
         return mapping
 
     def spec(self, file: Path) -> PolicySpec:
         """The policy as code wants it."""
-        same = {field.name: getattr(self, field.name) for field in fields(_Keys)}
-        seen = self.observation or Observation(cameras=(), image_size=16)
+        same = {key.name: getattr(self, key.name) for key in fields(_Keys)}
+        seen = self.observation or ObservationTable(cameras=(), image_size=16)
         return PolicySpec(**same, cameras=seen.cameras, image_size=seen.image_size, remote=self.remote, mapping=self.mapping, file=file)
 
 

@@ -2,6 +2,7 @@
 
 import string
 from collections.abc import Iterator, Mapping
+from dataclasses import field
 from typing import Annotated
 
 from pydantic import Discriminator, Field, Tag, ValidationInfo, field_validator, model_validator
@@ -10,14 +11,25 @@ from pydantic.dataclasses import dataclass
 from osel_sim.formats.catalogue import Catalogue, Entity
 from osel_sim.formats.levels import AXES
 from osel_sim.formats.terms import ATTRIBUTE, KINDS, PREDICATES, SKILLS, Signature, Term, TermOf
-from osel_sim.formats.toml_types import TABLE, FileName, Interval, OneOf, Texts, Version, between, ordered, refuse, shown, unknown_value
+from osel_sim.formats.toml_types import (
+    TABLE,
+    Faults,
+    FileName,
+    Interval,
+    OneOf,
+    Texts,
+    Version,
+    between,
+    ordered,
+    printable,
+    refuse,
+    shown,
+    unknown_value,
+)
 
 Kind = Annotated[str, OneOf(KINDS)]
 Predicate = Annotated[Term, TermOf(PREDICATES)]
 Skill = Annotated[Term, TermOf(SKILLS)]
-Count = Annotated[int, between(0, 1000)]
-Faults = Iterator[tuple[tuple[str | int, ...], str]]
-"""(place, problem) of each."""
 
 
 @dataclass(frozen=True, config=TABLE)
@@ -46,8 +58,15 @@ class Sorting:
     """Role whose thing fills this one if it has not."""
 
 
+def _form(value: object) -> str:
+    return "rule" if isinstance(value, dict | Sorting) else "kind"
+
+
+Unnamed = Annotated[Annotated[Kind, Tag("kind")] | Annotated[Sorting, Tag("rule")], Discriminator(_form)]
+
+
 @dataclass(frozen=True, kw_only=True, config=TABLE)
-class Scene:
+class SceneTable:
     """What stands and lies where."""
 
     arena: Annotated[str, OneOf(("table",))]
@@ -66,13 +85,13 @@ class Scene:
     """Buttons."""
     doors: Texts = ()
     """Doors."""
-    distractors: Annotated[tuple[Count, Count], ordered] = (0, 0)
+    distractors: Annotated[tuple[Annotated[int, between(0, 1000)], Annotated[int, between(0, 1000)]], ordered] = (0, 0)
     """Least and most objects besides those that fill a role."""
     axes: tuple[Annotated[str, OneOf(AXES)], ...] = AXES
     """The axes that levels may turn up in this task."""
     region: dict[Kind, Region]
     """Kind -> where its things start: a table for each kind that is there."""
-    start: dict[Kind, Interval] = Field(default_factory=dict)
+    start: dict[Kind, Interval] = field(default_factory=dict)
     """Kind with a part that moves -> range its joint starts in, as shares of its travel."""
 
     @field_validator(*(kind + "s" for kind in KINDS))
@@ -85,7 +104,7 @@ class Scene:
         return names
 
     @model_validator(mode="after")
-    def _is_not_empty(self) -> "Scene":
+    def _is_not_empty(self) -> "SceneTable":
         if not any(map(self.names, KINDS)):
             refuse((("objects",), f"the scene is empty; it takes {', '.join(kind + 's' for kind in KINDS)}"))
         return self
@@ -117,7 +136,7 @@ class Scene:
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
-class Language:
+class LanguageTable:
     """Phrasings: each has every role of [roles] in braces, and nothing else, so that it can only be followed by reading it."""
 
     train: Annotated[Texts, Field(min_length=1)]
@@ -127,11 +146,11 @@ class Language:
 
     def faults(self, roles: Mapping[str, str]) -> Faults:
         """Phrasings that do not name just these roles, or that are in both lists."""
-        wanted = ", ".join(f"{{{role}}}" for role in sorted(roles))
+        wanted = ", ".join(f"{{{printable(role)}}}" for role in sorted(roles))
         for key, templates in (("train", self.train), ("held_out", self.held_out)):
             for index, template in enumerate(templates):
                 try:
-                    fields = {field for _, field, _, _ in string.Formatter().parse(template) if field is not None}
+                    fields = {name for _, name, _, _ in string.Formatter().parse(template) if name is not None}
                 except ValueError as error:
                     yield (key, index), f"{shown(template)}: {error}"
                     continue
@@ -143,7 +162,7 @@ class Language:
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
-class Goal:
+class GoalTable:
     """When the task is done."""
 
     all: Annotated[tuple[Predicate, ...], Field(min_length=1)]
@@ -151,11 +170,15 @@ class Goal:
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
-class Plan:
+class ExpertTable:
     """How the scripted expert does it."""
 
     plan: tuple[Skill, ...]
     """Skills in order, such as `grasp(object)`."""
+
+
+type Terms = GoalTable | ExpertTable | dict[str, Term]
+"""A table of terms: the goal, the plan, or the subgoals."""
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
@@ -174,19 +197,17 @@ class TaskFile:
     """Control steps (20 Hz) after which an episode ends."""
     roles: Annotated[dict[str, Annotated[str, OneOf((*KINDS, ATTRIBUTE))]], Field(min_length=1)]
     """Role that an instruction names -> kind of thing that fills it, or `attribute`: a property such as "the red things"."""
-    unnamed: dict[str, Annotated[Annotated[Kind, Tag("kind")] | Annotated[Sorting, Tag("rule")], Discriminator(lambda value: _form(value))]] = Field(
-        default_factory=dict
-    )
+    unnamed: dict[str, Unnamed] = field(default_factory=dict)
     """Role that no instruction names -> kind of thing that fills it, or the rule by which another role's thing does."""
-    scene: Scene
+    scene: SceneTable
     """What stands and lies where."""
-    language: Language
+    language: LanguageTable
     """What people say."""
-    goal: Goal
+    goal: GoalTable
     """When the task is done."""
     subgoals: dict[str, Predicate]
     """Name -> predicate, in the order they are reached."""
-    expert: Plan
+    expert: ExpertTable
     """How the scripted expert does it."""
 
     @field_validator("unnamed")
@@ -198,7 +219,7 @@ class TaskFile:
 
     @field_validator("scene")
     @classmethod
-    def _fills_the_roles(cls, scene: Scene, info: ValidationInfo) -> Scene:
+    def _fills_the_roles(cls, scene: SceneTable, info: ValidationInfo) -> SceneTable:
         roles, unnamed = info.data.get("roles"), info.data.get("unnamed")
         if info.context is None or roles is None or unnamed is None:
             return scene
@@ -208,23 +229,19 @@ class TaskFile:
 
     @field_validator("language")
     @classmethod
-    def _names_the_roles(cls, language: Language, info: ValidationInfo) -> Language:
+    def _names_the_roles(cls, language: LanguageTable, info: ValidationInfo) -> LanguageTable:
         if "roles" in info.data and (faults := list(language.faults(info.data["roles"]))):
             refuse(*faults)
         return language
 
     @field_validator("goal", "subgoals", "expert")
     @classmethod
-    def _are_about_the_roles(cls, terms: Goal | Plan | dict[str, Term], info: ValidationInfo) -> Goal | Plan | dict[str, Term]:
+    def _are_about_the_roles(cls, terms: Terms, info: ValidationInfo) -> Terms:
         if "roles" in info.data and "unnamed" in info.data:
             kinds = _kinds(info.data["roles"], info.data["unnamed"])
             if faults := [(place, fault) for place, term, known in _terms(terms) for fault in term.faults(known, kinds)]:
                 refuse(*faults)
         return terms
-
-
-def _form(value: object) -> str:
-    return "rule" if isinstance(value, dict | Sorting) else "kind"
 
 
 def _unnamed_faults(unnamed: Mapping[str, str | Sorting], roles: Mapping[str, str]) -> Faults:
@@ -247,11 +264,11 @@ def _kinds(roles: Mapping[str, str], unnamed: Mapping[str, str | Sorting]) -> di
     return {**roles, **{role: roles[value.then] if isinstance(value, Sorting) else value for role, value in unnamed.items()}}
 
 
-def _terms(terms: Goal | Plan | Mapping[str, Term]) -> Iterator[tuple[tuple[str | int, ...], Term, Mapping[str, Signature]]]:
+def _terms(terms: Terms) -> Iterator[tuple[tuple[str | int, ...], Term, Mapping[str, Signature]]]:
     """(place, term, known terms) of each term of a table."""
-    if isinstance(terms, Goal):
+    if isinstance(terms, GoalTable):
         yield from ((("all", index), term, PREDICATES) for index, term in enumerate(terms.all))
-    elif isinstance(terms, Plan):
+    elif isinstance(terms, ExpertTable):
         yield from ((("plan", index), term, SKILLS) for index, term in enumerate(terms.plan))
     else:
         yield from (((name,), term, PREDICATES) for name, term in terms.items())

@@ -1,6 +1,6 @@
 """What pydantic models of TOML files share: their configuration and the types of their values."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -11,8 +11,12 @@ from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, cor
 from osel_sim.core.errors import did_you_mean
 
 TABLE = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True, defer_build=True)
-"""Configuration of every model: unknown keys are refused, numbers are finite, docstrings of attributes are the JSON Schema's descriptions."""
+"""Configuration of every model: unknown keys are refused, numbers are finite, docstrings of attributes are the JSON Schema's descriptions.
 
+Validators see the fields above theirs (`info.data`): defaults are `dataclasses.field`s, as pydantic would put its own `Field`s before all others."""
+
+Faults = Iterator[tuple[tuple[str | int, ...], str]]
+"""What a validator found wrong: (place within the value, problem) of each fault."""
 LONGEST = 80
 """Values are shown up to so many characters."""
 
@@ -46,10 +50,15 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST else text[:LONGEST] + "..."
 
 
+def printable(name: str) -> str:
+    """A name as error messages show it: as it is, or quoted where it is empty, long or has control characters."""
+    return name if name and name.isprintable() and len(name) <= LONGEST else shown(name)
+
+
 def unknown_value(value: str, known: Iterable[str]) -> str:
     """What is wrong with a value that is not among those known."""
     known = list(known)
-    return f"unknown value {shown(value)}, {did_you_mean(value, known)}known: {', '.join(known)}"
+    return f"unknown value {shown(value)}, {did_you_mean(value, known)}known: {', '.join(map(printable, known))}"
 
 
 def refuse(*faults: tuple[tuple[str | int, ...], str]) -> NoReturn:

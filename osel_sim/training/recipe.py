@@ -1,6 +1,6 @@
 """A training recipe: the sizes of a policy and how it is trained; one TOML file in policies/training/ for each policy trained here."""
 
-from dataclasses import asdict, field
+from dataclasses import asdict, field, fields
 from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -78,7 +78,7 @@ class Augmentation:
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
-class Data:
+class DataTable:
     """Which demonstrations are used."""
 
     tasks: Texts | None = None
@@ -99,7 +99,7 @@ class RecipeFile:
     """Of the format."""
     model: ModelSizes
     """The type of model and its sizes; those left out are as the type's configuration has them."""
-    data: Data = field(default_factory=Data)
+    data: DataTable = field(default_factory=DataTable)
     """Which demonstrations are used."""
     optimisation: Optimisation = field(default_factory=Optimisation)
     """How the weights are found."""
@@ -114,7 +114,7 @@ class Recipe:
     Attributes:
         type: a LeRobot policy type.
         model: sizes, keyword arguments of the type's configuration.
-        tasks, weights, episodes, validation_episodes: as `Data` explains them.
+        tasks, weights, episodes, validation_episodes: as `DataTable` explains them.
     """
 
     type: str
@@ -152,11 +152,10 @@ def load_recipe(file: Path) -> Recipe:
         ContentError: naming the file, the key and what would be right.
     """
     found = load_toml(RecipeFile, file)
-    sizes: dict[str, Any] = {**found.model}
-    kind = sizes.pop("type")
+    sizes = {size.name: getattr(found.model, size.name) for size in fields(found.model) if size.name != "type"}
     return Recipe(
-        type=kind,
-        model=sizes,
+        type=found.model.type,
+        model={name: size for name, size in sizes.items() if size is not None},
         tasks=found.data.tasks,
         weights=found.data.weights,
         episodes=found.data.episodes,
