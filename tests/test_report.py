@@ -15,11 +15,11 @@ from PIL import Image
 from report_helpers import EVIL, FAR, NEAR, WEIGHTS, made_log, made_replay, made_run
 from synthetic_log import make_row, write_log
 
-from osel_sim import report
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.log import read_log
 from osel_sim.core.errors import UsageError
 from osel_sim.episodes.tensorboard import check_installed
+from osel_sim.report import main as report_main
 from osel_sim.reporting import episodes
 from osel_sim.reporting.description import DARK, LIGHT, Bars, Column, Figure, Heat, Line, Panel, Points, Table, colours, thinned
 from osel_sim.reporting.episodes import MOST_EPISODES, list_episodes
@@ -39,7 +39,7 @@ def log(tmp_path_factory):
 def page_of_log(log, tmp_path_factory):
     """The folder with the report of the log."""
     folder = tmp_path_factory.mktemp("page")
-    assert report.main([str(log.source), "--out", str(folder), "--alpha-time", "0.1", "--alpha-price", "0.01"]) == 0
+    assert report_main([str(log.source), "--out", str(folder), "--alpha-time", "0.1", "--alpha-price", "0.01"]) == 0
     return folder
 
 
@@ -79,7 +79,7 @@ def test_words_from_a_log_stay_words(page_of_log):
 
 def test_page_of_a_replay(log, tmp_path):
     folder = made_replay(tmp_path, log)
-    assert report.main([str(folder)]) == 0
+    assert report_main([str(folder)]) == 0
     page = (folder / "report.html").read_text()
     data = embedded(page)
     assert {"curves", "regret", "gap_closed", "success_against_penalty", "choices", "frontier"} <= set(data["figures"])
@@ -103,19 +103,19 @@ def test_a_replay_whose_log_has_moved(log, tmp_path, capsys):
     result = json.loads((folder / "replay.json").read_text())
     result["log"]["folder"] = str(tmp_path / "gone")
     (folder / "replay.json").write_text(json.dumps(result))
-    assert report.main([str(folder)]) == 2
+    assert report_main([str(folder)]) == 2
     assert "give its folder with --log" in capsys.readouterr().err
     other = made_log(tmp_path / "other", instances=30)
-    assert report.main([str(folder), "--log", str(other.source)]) == 2
+    assert report_main([str(folder), "--log", str(other.source)]) == 2
     assert "are not in this log" in capsys.readouterr().err
     assert not (folder / "report.html").exists()
-    assert report.main([str(folder), "--log", str(log.source)]) == 0
+    assert report_main([str(folder), "--log", str(log.source)]) == 0
     assert (folder / "report.html").exists()
 
 
 def test_page_of_a_live_run(tmp_path):
     folder = made_run(tmp_path)
-    assert report.main([str(folder)]) == 0
+    assert report_main([str(folder)]) == 0
     page = (folder / "report.html").read_text()
     data = embedded(page)
     assert {"curves", "regret", "success_against_penalty", "choices", "propensities", "times"} <= set(data["figures"])
@@ -132,7 +132,7 @@ def test_page_of_a_live_run(tmp_path):
 
 def test_page_of_a_run_that_knows_only_what_was_chosen(tmp_path):
     folder = made_run(tmp_path, decisions=5, counterfactual=False)
-    assert report.main([str(folder)]) == 0
+    assert report_main([str(folder)]) == 0
     page = (folder / "report.html").read_text()
     assert "run with --counterfactual to compare" in page
     assert "regret" not in embedded(page)["figures"]
@@ -148,17 +148,17 @@ def test_videos_are_put_into_the_page_or_linked_from_it(tmp_path, monkeypatch):
     for shade in range(8):
         writer.send(np.full((32, 32, 3), 20 * shade, np.uint8))
     writer.close()
-    assert report.main([str(folder)]) == 0
+    assert report_main([str(folder)]) == 0
     (video,) = embedded((folder / "report.html").read_text())["episodes"]["videos"].values()
     assert base64.b64decode(video["data"]) == film.read_bytes() and len(video["frames"]) == 5
     monkeypatch.setattr(episodes, "MOST_VIDEO_BYTES", 10)
-    assert report.main([str(folder), "--out", str(tmp_path / "elsewhere")]) == 0
+    assert report_main([str(folder), "--out", str(tmp_path / "elsewhere")]) == 0
     (video,) = embedded((tmp_path / "elsewhere" / "report.html").read_text())["episodes"]["videos"].values()
     assert "data" not in video and (tmp_path / "elsewhere" / unquote(video["file"])).resolve() == film
 
 
 def test_the_same_input_is_the_same_bytes(log, page_of_log, tmp_path, capsys):
-    assert report.main([str(log.source), "--out", str(tmp_path), "--alpha-time", "0.1", "--alpha-price", "0.01"]) == 0
+    assert report_main([str(log.source), "--out", str(tmp_path), "--alpha-time", "0.1", "--alpha-price", "0.01"]) == 0
     assert str(tmp_path / "report.html") in capsys.readouterr().out
     files = {file.relative_to(page_of_log): file.read_bytes() for file in page_of_log.rglob("*") if file.is_file()}
     assert len(files) > 15
@@ -167,10 +167,10 @@ def test_the_same_input_is_the_same_bytes(log, page_of_log, tmp_path, capsys):
 
 
 def test_wrong_folders_and_flags(tmp_path, capsys):
-    assert report.main([str(tmp_path)]) == 2
+    assert report_main([str(tmp_path)]) == 2
     assert "holds neither episodes.jsonl (a live run), replay.json (a replay) nor rollouts.parquet" in capsys.readouterr().err
     folder = made_run(tmp_path / "run", decisions=3)
-    assert report.main([str(folder), "--alpha-time", "1"]) == 2
+    assert report_main([str(folder), "--alpha-time", "1"]) == 2
     assert "--alpha-time" in capsys.readouterr().err
     assert not (folder / "report.html").exists()
 

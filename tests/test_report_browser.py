@@ -9,7 +9,7 @@ import pytest
 from report_helpers import EVIL, FAR, made_log, made_replay, made_run
 from synthetic_log import make_row, write_log
 
-from osel_sim import report
+from osel_sim.report import main as report_main
 
 CHROMIUM, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 ARGUMENTS = (
@@ -47,7 +47,7 @@ def pages(tmp_path_factory):
     made_table(folder / "table")
     names = ("log", "replay", "run", "table")
     for name in names:
-        assert report.main([str(folder / name)]) == 0
+        assert report_main([str(folder / name)]) == 0
     return {name: folder / name / "report.html" for name in names}
 
 

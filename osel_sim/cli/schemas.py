@@ -1,6 +1,5 @@
 """Write the JSON Schemas of all TOML files, for editors that complete and check: `make schemas`."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +7,6 @@ from pydantic import TypeAdapter
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
-from osel_sim import cli
 from osel_sim.core import content
 from osel_sim.core.files import write_json
 from osel_sim.formats.catalogue import CatalogueFile
@@ -49,19 +47,12 @@ def schemas() -> dict[str, dict[str, Any]]:
     }
 
 
-@cli.main
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
-    parser = cli.Parser("cli.schemas", "Write the JSON Schemas of task, policy and other TOML files.", "examples:\n  make schemas")
-    parser.add_argument("--out", type=Path, default=content.root() / "docs" / "schemas", metavar="DIR", help="default: docs/schemas")
-    out: Path = parser.parse_args(arguments).out
-    out.mkdir(parents=True, exist_ok=True)
+def write_schemas(folder: Path) -> None:
+    """Write `NAME.schema.json` of each kind of file."""
+    folder.mkdir(parents=True, exist_ok=True)
     for name, schema in schemas().items():
-        file = out / f"{name}.schema.json"
-        write_json(file, schema)
-        print(file)
-    return 0
+        write_json(folder / f"{name}.schema.json", schema)
 
 
 if __name__ == "__main__":
-    sys.exit(main(None))
+    write_schemas(content.root() / "docs" / "schemas")

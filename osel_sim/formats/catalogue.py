@@ -12,7 +12,7 @@ from pydantic_core import PydanticKnownError
 
 from osel_sim.formats.terms import KINDS
 from osel_sim.formats.toml_file import load_toml
-from osel_sim.formats.toml_types import TABLE, Faults, Number, Texts, Version, between, refuse, shown, unknown_value
+from osel_sim.formats.toml_types import TABLE, Faults, Number, Texts, Version, between, quoted, refuse, unknown_value
 
 _EXTENTS = {"box": 3, "cylinder": 2}
 """Models that are built from their size, and how many numbers that has."""
@@ -54,7 +54,7 @@ class Thing:
     @classmethod
     def _can_be_built(cls, model: str) -> str:
         if not (model in _EXTENTS or model.startswith("robosuite:") or model.endswith(".xml")):
-            raise ValueError(f'must be "box", "cylinder", "robosuite:<class>" or an .xml file, got {shown(model)}')
+            raise ValueError(f'must be "box", "cylinder", "robosuite:<class>" or an .xml file, got {quoted(model)}')
         return model
 
     @field_validator("size")
@@ -64,7 +64,7 @@ class Thing:
         if size is None and wanted:
             raise PydanticKnownError("missing")
         if size is not None and "model" in info.data and len(size) != wanted:
-            raise ValueError(f"must be a list of {wanted} numbers, got {shown(list(size))}" if wanted else "is only for the models box and cylinder")
+            raise ValueError(f"must be a list of {wanted} numbers, got {quoted(list(size))}" if wanted else "is only for the models box and cylinder")
         return size
 
     @field_validator("rgba")

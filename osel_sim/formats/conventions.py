@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import AfterValidator
 from pydantic.dataclasses import dataclass
 
-from osel_sim.formats.toml_types import TABLE, Faults, Number, OneOf, Switch, Texts, between, shown, unknown_value
+from osel_sim.formats.toml_types import TABLE, Faults, Number, OneOf, Switch, Texts, between, quoted, unknown_value
 
 STATE_PARTS = {"position": 3, "axis_angle": 3, "quaternion": 4, "euler": 3, "fingers": 2, "gripper": 1}
 """What a state can be put together from, and how many numbers each has: gripper position (metres, world); its orientation as axis-angle, quaternion
@@ -22,7 +22,7 @@ ENVIRONMENT_STATES = ("hashed_text",)
 
 def _none_or_all(columns: tuple[int, ...]) -> tuple[int, ...]:
     if len(columns) not in (0, ACTION_SIZE):
-        raise ValueError(f"must be {ACTION_SIZE} column numbers of an action, counted from 0, got {shown(list(columns))}")
+        raise ValueError(f"must be {ACTION_SIZE} column numbers of an action, counted from 0, got {quoted(list(columns))}")
     return columns
 
 
@@ -70,4 +70,4 @@ class Conventions:
         keys = [*map(self.key, cameras), *self.blank, self.prompt, *([self.state] if self.state else [])]
         for key in dict.fromkeys(keys):
             if keys.count(key) > 1:
-                yield ("images",), f"two inputs have the name {shown(key)}"
+                yield ("images",), f"two inputs have the name {quoted(key)}"

@@ -1,5 +1,6 @@
 """A policy file: what drives the robot, where it runs, what it needs to see, what it costs."""
 
+import re
 from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,7 @@ from pydantic_core import PydanticKnownError
 
 from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.toml_file import load_toml
-from osel_sim.formats.toml_types import TABLE, FileName, OneOf, Texts, Version, between, refuse, shown
+from osel_sim.formats.toml_types import TABLE, FileName, OneOf, Texts, Version, between, quoted, refuse
 
 NETWORKS = ("none", "ethernet", "wifi", "lte", "satellite")  # the profiles themselves: osel_sim.remote.network
 CAMERAS = ("agentview", "wrist")
@@ -57,7 +58,10 @@ class Remote:
     @classmethod
     def _is_a_websockets(cls, url: str | None) -> str | None:
         if url is not None and not url.startswith(("ws://", "wss://")):
-            raise ValueError(f"must start with ws:// or wss://, got {shown(url)}")
+            told = f", got {quoted(url)}" if re.fullmatch(r"\w+://[\w.-]*", url) else ""  # else there may be a password in it
+            raise ValueError(f"must start with ws:// or wss://{told}")
+        if url is not None and not re.fullmatch(r"wss?://[^\s\"'<>]+", url):
+            raise ValueError("must hold no spaces, quotes, < or > (within a password: %20, %22, %27, %3C, %3E)")
         return url
 
 
@@ -74,7 +78,7 @@ class ObservationTable:
     @classmethod
     def _differ(cls, cameras: tuple[str, ...]) -> tuple[str, ...]:
         if len(set(cameras)) < len(cameras):
-            raise ValueError(_CAMERAS_WANTED + f"got {shown(list(cameras))}")
+            raise ValueError(_CAMERAS_WANTED + f"got {quoted(list(cameras))}")
         return cameras
 
 

@@ -9,6 +9,7 @@ from osel_sim.formats.levels import AXES
 from osel_sim.formats.task_schema import Region, Sorting, TaskFile
 from osel_sim.formats.terms import ATTRIBUTE, KINDS, Term
 from osel_sim.formats.toml_file import load_toml
+from osel_sim.interface.robot import DEFAULT_ROBOT
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class TaskSpec:
         subgoals: (name, predicate), in the order they are reached.
         plan: the scripted expert's skills.
         axes: the axes that levels may turn up in this task.
+        robot: name of the robot that does it (`osel_sim.sim.robots`).
     """
 
     name: str
@@ -53,6 +55,7 @@ class TaskSpec:
     plan: tuple[Term, ...]
     file: Path
     axes: tuple[str, ...] = AXES
+    robot: str = DEFAULT_ROBOT
 
     def entity(self, name: str) -> Entity:
         """The thing of that name."""
@@ -102,4 +105,5 @@ def _spec(task: TaskFile, file: Path, catalogue: Catalogue) -> TaskSpec:
         plan=task.expert.plan,
         file=file,
         axes=task.scene.axes,
+        robot=task.robot,
     )

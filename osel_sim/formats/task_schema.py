@@ -10,7 +10,7 @@ from pydantic.dataclasses import dataclass
 
 from osel_sim.formats.catalogue import Catalogue, Entity
 from osel_sim.formats.levels import AXES
-from osel_sim.formats.terms import ATTRIBUTE, KINDS, PREDICATES, SKILLS, Signature, Term, TermOf
+from osel_sim.formats.terms import ATTRIBUTE, KINDS, PREDICATES, SKILLS, Term, TermOf
 from osel_sim.formats.toml_types import (
     TABLE,
     Faults,
@@ -21,11 +21,13 @@ from osel_sim.formats.toml_types import (
     Version,
     between,
     ordered,
-    printable,
+    plain_name,
+    quoted,
     refuse,
-    shown,
     unknown_value,
 )
+from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.interface.terms import Signature
 
 Kind = Annotated[str, OneOf(KINDS)]
 Predicate = Annotated[Term, TermOf(PREDICATES)]
@@ -146,19 +148,19 @@ class LanguageTable:
 
     def faults(self, roles: Mapping[str, str]) -> Faults:
         """Phrasings that do not name just these roles, or that are in both lists."""
-        wanted = ", ".join(f"{{{printable(role)}}}" for role in sorted(roles))
+        wanted = ", ".join(f"{{{plain_name(role)}}}" for role in sorted(roles))
         for key, templates in (("train", self.train), ("held_out", self.held_out)):
             for index, template in enumerate(templates):
                 try:
                     fields = {name for _, name, _, _ in string.Formatter().parse(template) if name is not None}
                 except ValueError as error:
-                    yield (key, index), f"{shown(template)}: {error}"
+                    yield (key, index), f"{quoted(template)}: {error}"
                     continue
                 if fields != set(roles):
-                    yield (key, index), f"{shown(template)} must name {wanted} and nothing else, so that it can only be followed by reading it"
+                    yield (key, index), f"{quoted(template)} must name {wanted} and nothing else, so that it can only be followed by reading it"
         for index, template in enumerate(self.held_out):
             if template in self.train:
-                yield ("held_out", index), f"repeats a training phrasing: {shown(template)}"
+                yield ("held_out", index), f"repeats a training phrasing: {quoted(template)}"
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
@@ -195,6 +197,8 @@ class TaskFile:
     """Words by which several tasks are asked for at once (`--task tag:WORD`)."""
     horizon: Annotated[int, between(1, 100_000)]
     """Control steps (20 Hz) after which an episode ends."""
+    robot: str = DEFAULT_ROBOT
+    """The robot that does it, where it is not the usual one."""
     roles: Annotated[dict[str, Annotated[str, OneOf((*KINDS, ATTRIBUTE))]], Field(min_length=1)]
     """Role that an instruction names -> kind of thing that fills it, or `attribute`: a property such as "the red things"."""
     unnamed: dict[str, Unnamed] = field(default_factory=dict)

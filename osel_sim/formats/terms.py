@@ -8,7 +8,9 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, core_schema
 
-from osel_sim.formats.toml_types import shown, unknown_value
+from osel_sim.core.registry import Registry
+from osel_sim.formats.toml_types import quoted, unknown_value
+from osel_sim.interface.terms import Predicate, Signature, Skill
 
 KINDS = ("object", "container", "zone", "peg", "drawer", "button", "door")
 """Kinds of things. Objects lie loose; all others stand fast, some with a part that moves."""
@@ -21,34 +23,37 @@ HINGED = ("drawer", "door")
 ARTICULATED = (*HINGED, "button")
 """Kinds with a part that moves."""
 
-Signature = tuple[tuple[str, ...], ...]
-"""Kinds that each argument may be of."""
 
-PREDICATES: Mapping[str, Signature] = {
-    "near": (KINDS,),
-    "grasped": (KINDS,),
-    "lifted": (("object",),),
-    "released": (KINDS,),
-    "in": (("object",), RECEPTACLES),
-    "on": (("object",), ("object",)),
-    "opened": (HINGED,),
-    "closed": (HINGED,),
-    "pressed": (("button",),),
-}
-"""Known predicates (osel_sim.sim.predicates has their meaning)."""
+class Signatures(Mapping[str, Signature]):
+    """Name -> kinds of arguments, of predicates or skills; imported when they are asked for."""
 
-SKILLS: Mapping[str, Signature] = {
-    "reach": (KINDS,),
-    "grasp": (KINDS,),
-    "lift": (("object",),),
-    "move": (("object",), (*RECEPTACLES, "object")),
-    "place": (("object",), (*RECEPTACLES, "object")),
-    "push": (("object",), ("zone",)),
-    "open": (HINGED,),
-    "close": (HINGED,),
-    "press": (("button",),),
-}
-"""Known skills of the scripted expert (osel_sim.sim.expert)."""
+    def __init__(self, registry: Registry[Predicate] | Registry[Skill]) -> None:
+        self._registry = registry
+
+    def __getitem__(self, name: str) -> Signature:
+        if name not in self._registry:
+            raise KeyError(name)
+        return self._registry.load(name).kinds
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._registry)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self._registry)
+
+
+_PREDICATES = ("near", "grasped", "released", "lifted", "on", "opened", "closed", "pressed")
+_SKILLS = ("reach", "grasp", "lift", "move", "place", "push", "open", "close", "press")
+
+predicates = Registry(
+    "predicate",
+    "osel_sim.predicates",
+    {"in": "osel_sim.sim.predicates:inside"} | {name: f"osel_sim.sim.predicates:{name}" for name in _PREDICATES},
+    Predicate,
+)
+skills = Registry("skill", "osel_sim.skills", {name: f"osel_sim.sim.skills:{name}" for name in _SKILLS}, Skill)
+PREDICATES: Mapping[str, Signature] = Signatures(predicates)
+SKILLS: Mapping[str, Signature] = Signatures(skills)
 
 
 @dataclass(frozen=True)
@@ -70,9 +75,9 @@ class Term:
         """
         for role, kinds in zip(self.roles, known[self.name], strict=True):
             if role not in roles:
-                yield f"{shown(str(self))}: {unknown_value(role, roles)}"
+                yield f"{quoted(str(self))}: {unknown_value(role, roles)}"
             elif roles[role] not in kinds:
-                yield f"{shown(str(self))}: {role!r} is of kind {roles[role]!r}, {self.name} wants one of {', '.join(kinds)}"
+                yield f"{quoted(str(self))}: {role!r} is of kind {roles[role]!r}, {self.name} wants one of {', '.join(kinds)}"
 
 
 @dataclass(frozen=True)
@@ -85,15 +90,15 @@ class TermOf:
         return core_schema.no_info_after_validator_function(self._parse, core_schema.str_schema())
 
     def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        return {**handler(schema), "pattern": rf"^\s*({'|'.join(self.known)})\s*\([^()]*\)\s*$"}
+        return {**handler(schema), "pattern": r"^\s*\w+\s*\([^()]*\)\s*$"}  # which names there are, packages may add to
 
     def _parse(self, text: str) -> Term:
         name, bracket, rest = (part.strip() for part in text.partition("("))
         if not bracket or not rest.endswith(")"):
-            raise ValueError(f"{shown(text)} must read name(role, ...)")
+            raise ValueError(f"{quoted(text)} must read name(role, ...)")
         if name not in self.known:
-            raise ValueError(f"{shown(text)}: {unknown_value(name, self.known)}")
+            raise ValueError(f"{quoted(text)}: {unknown_value(name, self.known)}")
         roles = tuple(part.strip() for part in rest[:-1].split(","))
         if len(roles) != len(self.known[name]):
-            raise ValueError(f"{shown(text)}: {name} takes {len(self.known[name])} role(s), got {len(roles)}")
+            raise ValueError(f"{quoted(text)}: {name} takes {len(self.known[name])} role(s), got {len(roles)}")
         return Term(name, roles)

@@ -1,6 +1,7 @@
 """What pydantic found wrong with a TOML file, in plain words: the key, and what would be right."""
 
 import copy
+from collections.abc import Iterable
 from typing import Any
 
 from pydantic import ValidationError
@@ -8,7 +9,7 @@ from pydantic_core import ErrorDetails
 
 from osel_sim.core.errors import nearest
 from osel_sim.formats.schema_node import Node, Place
-from osel_sim.formats.toml_types import printable, shown, unknown_value
+from osel_sim.formats.toml_types import plain_name, quoted, unknown_value
 
 _UNKNOWN_KEY = ("unexpected_keyword_argument", "extra_forbidden")
 _BOUNDS = ("greater_than_equal", "less_than_equal", "finite_number")
@@ -50,7 +51,7 @@ def spelt_right(error: ValidationError, schema: Node, data: dict[str, Any]) -> t
         if table is None:  # it lay in a table whose key is corrected now: the next look finds it there
             continue
         known = [other for other in node.keys if other != key]
-        near = near or nearest(key, [other for other in known if other not in table], _LIKENESS) or nearest(key, known, _LIKENESS)
+        near = near or _nearest(key, [other for other in known if other not in table]) or _nearest(key, known)
         hint = f", did you mean {near!r}?" if near else f"; known: {', '.join(sorted(known))}"
         found.append((_called((*place, key)), f"is not a known key{hint}"))
         value = table.pop(key)
@@ -67,7 +68,11 @@ def _misspelt(schema: Node, detail: ErrorDetails) -> tuple[Place, Node, str | No
     if detail["type"] != "union_tag_not_found" or node.tag is None or not isinstance(table, dict):
         return place, node, None, None
     tag, _ = node.tag  # without it, pydantic does not know which keys to look for
-    return place, node, nearest(tag, set(table) - set(node.keys), _LIKENESS), tag
+    return place, node, _nearest(tag, set(table) - set(node.keys)), tag
+
+
+def _nearest(key: str, known: Iterable[str]) -> str | None:
+    return next(iter(nearest(key, known, cutoff=_LIKENESS)), None)
 
 
 def _unknown_key(detail: ErrorDetails) -> Place | None:
@@ -95,7 +100,7 @@ def _fault(schema: Node, detail: ErrorDetails) -> tuple[str, str]:
     if kind == "fault":
         return _called(place), detail["msg"]
     if kind == "wanted":
-        return _called(place), f"must be {detail['msg']}, got {shown(value)}"
+        return _called(place), f"must be {detail['msg']}, got {quoted(value)}"
     if kind == "value_error":
         return _called(place), str(detail["ctx"]["error"])
     if kind == "missing" and isinstance(place[-1], str):
@@ -116,7 +121,8 @@ def _tag(place: Place, key: str, known: list[str], table: dict[str, Any]) -> tup
     if key not in table:
         return _called((*place, key)), f"is missing, expected one of {', '.join(known)}"
     given = table[key]
-    return _called((*place, key)), unknown_value(given, known) if isinstance(given, str) else f"must be one of {', '.join(known)}, got {shown(given)}"
+    problem = unknown_value(given, known) if isinstance(given, str) else f"must be one of {', '.join(known)}, got {quoted(given)}"
+    return _called((*place, key)), problem
 
 
 def _wrong(node: Node, kind: str, value: object) -> str:
@@ -125,19 +131,19 @@ def _wrong(node: Node, kind: str, value: object) -> str:
     if kind in _BOUNDS and bounded is not None:
         number = float(value) if bounded["type"] == "number" else value  # type: ignore[arg-type]  # it was found to be a number
         bounds = f"lie in [{bounded['minimum']}, {bounded['maximum']}]" if "maximum" in bounded else f"be {bounded['minimum']} or more"
-        return f"must {bounds}, got {shown(number)}"
+        return f"must {bounds}, got {quoted(number)}"
     if kind == "finite_number":
-        return f"must be a finite number, got {shown(value)}"
+        return f"must be a finite number, got {quoted(value)}"
     if kind == "float_type" and isinstance(value, int) and not isinstance(value, bool):
         return "is an integer too large to be a number"
     if kind in ("string_too_short", "too_short") and not value:
         return "must not be empty"
-    return f"must be {node.wanted}, got {shown(value)}"
+    return f"must be {node.wanted}, got {quoted(value)}"
 
 
 def _called(place: Place) -> str:
     """`scene.region.object.x`, `language.train[3]`."""
     text = ""
     for step in place:
-        text += f"[{step}]" if isinstance(step, int) else ("." if text else "") + printable(step)
+        text += f"[{step}]" if isinstance(step, int) else ("." if text else "") + plain_name(step)
     return text

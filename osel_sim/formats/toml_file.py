@@ -10,8 +10,10 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from osel_sim.core.errors import ContentError
+from osel_sim.core.shown import unprintable
 from osel_sim.formats.schema_node import Node
 from osel_sim.formats.toml_faults import faults_of, spelt_right
+from osel_sim.formats.toml_types import LONGEST
 
 
 def load_toml[T](model: type[T], file: Path, context: Mapping[str, Any] | None = None) -> T:
@@ -57,7 +59,7 @@ def check[T](
         ContentError: naming the file and, for each fault, the key and what would be right.
     """
     adapter: TypeAdapter[T] = _adapter(model)  # type: ignore[arg-type]  # classes are hashable
-    found: list[tuple[str, str]] = []
+    found = [(key, f"has a control character in it: {text[:LONGEST]!r}") for key, text in unprintable(data)]
     while True:
         try:
             result = adapter.validate_python(data, context={"file": file, "data": data, **(context or {})})

@@ -41,7 +41,7 @@ def at_least(low: int) -> Any:
     return Field(strict=True, ge=low)
 
 
-def shown(value: object) -> str:
+def quoted(value: object) -> str:
     """A value as error messages show it: control characters escaped, at most `LONGEST` characters of it."""
     try:
         text = repr(value)
@@ -50,15 +50,15 @@ def shown(value: object) -> str:
     return text if len(text) <= LONGEST else text[:LONGEST] + "..."
 
 
-def printable(name: str) -> str:
+def plain_name(name: str) -> str:
     """A name as error messages show it: as it is, or quoted where it is empty, long or has control characters."""
-    return name if name and name.isprintable() and len(name) <= LONGEST else shown(name)
+    return name if name and name.isprintable() and len(name) <= LONGEST else quoted(name)
 
 
 def unknown_value(value: str, known: Iterable[str]) -> str:
     """What is wrong with a value that is not among those known."""
     known = list(known)
-    return f"unknown value {shown(value)}, {did_you_mean(value, known)}known: {', '.join(map(printable, known))}"
+    return f"unknown value {quoted(value)}, {did_you_mean(value, known)}known: {', '.join(map(plain_name, known))}"
 
 
 def refuse(*faults: tuple[tuple[str | int, ...], str]) -> NoReturn:
@@ -71,13 +71,13 @@ def refuse(*faults: tuple[tuple[str | int, ...], str]) -> NoReturn:
 
 def _ordered(pair: tuple[float, float]) -> tuple[float, float]:
     if pair[0] > pair[1]:
-        raise ValueError(f"must be [low, high] with low <= high, got {shown(list(pair))}")
+        raise ValueError(f"must be [low, high] with low <= high, got {quoted(list(pair))}")
     return pair
 
 
 def _is_the_files(name: str, info: ValidationInfo) -> str:
     if info.context is not None and name != (stem := Path(info.context["file"]).stem):
-        raise ValueError(f"must equal the file's name {stem!r}, got {shown(name)}")
+        raise ValueError(f"must equal the file's name {stem!r}, got {quoted(name)}")
     return name
 
 

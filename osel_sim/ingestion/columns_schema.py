@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag, ValidationInfo, model_validator
 from pydantic.dataclasses import dataclass
 
-from osel_sim.formats.toml_types import TABLE, Faults, OneOf, Text, Texts, Version, printable, refuse, shown
+from osel_sim.formats.toml_types import TABLE, Faults, OneOf, Text, Texts, Version, plain_name, quoted, refuse
 from osel_sim.ingestion.columns import (
     COMMAND_LINE,
     DUPLICATES,
@@ -31,7 +31,7 @@ def _template(text: str) -> str:
     if not text:
         raise ValueError("must be a column, or a template with columns in braces")
     if re.search(r"[{}]", FIELD.sub("", text)):
-        raise ValueError(f"{shown(text)} has a brace too many or too few; {{COLUMN}} stands for a column's text, other braces a text cannot have")
+        raise ValueError(f"{quoted(text)} has a brace too many or too few; {{COLUMN}} stands for a column's text, other braces a text cannot have")
     return text if FIELD.search(text) else "{" + text + "}"
 
 
@@ -39,7 +39,7 @@ def _threshold_or_words(success: Success) -> Success:
     if (success.at_least is None) == (not success.true) or bool(success.true) != bool(success.false) or (success.divide and success.at_least is None):
         raise ValueError("give either at_least (with numbers), or both true and false (lists of words)")
     if both := set(success.true) & set(success.false):
-        refuse((("true",), f"{shown(min(both))} is in false as well"))
+        refuse((("true",), f"{quoted(min(both))} is in false as well"))
     return success
 
 
@@ -228,9 +228,9 @@ class ColumnsFile:
             heirs = [name for name, policy in self.policies.items() if getattr(policy, key) is None]
             value = context.get("data", {}).get("outcome", {}).get(key)
             if len(heirs) > 1 and isinstance(value, str | list | dict) and PLACE not in str(value):
-                names = ", ".join(map(printable, heirs))
+                names = ", ".join(map(plain_name, heirs))
                 yield (
                     ("outcome", key),
-                    f"is {shown(value)} for each of {names}; let {PLACE} in it stand for the policy's name, or give each policy its own; "
+                    f"is {quoted(value)} for each of {names}; let {PLACE} in it stand for the policy's name, or give each policy its own; "
                     f"if the table is long, name its column of policies ({way})",
                 )

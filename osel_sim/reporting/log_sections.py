@@ -41,7 +41,7 @@ def policy_blocks(log: LoggedOutcomes, weights: RewardWeights) -> list[Figure | 
     blocks: list[Figure | Table] = [
         _policy_table("policies", "Policies" if len(set(log.labels("task"))) == 1 else "Policies by task", per_group(log, weights, "task"), log)
     ]
-    for attribute, word in (("task", "task"), ("target", "object asked for")):
+    for attribute, word in (("task", "task"), ("robot", "robot"), ("target", "object asked for")):
         results = per_group(log, weights, attribute)
         if len({result.group for result in results}) == 1:
             continue

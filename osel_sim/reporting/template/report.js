@@ -136,9 +136,10 @@
     const columns = Object.keys(book.episodes);
     const all = book.episodes.instance.map((_, row) => Object.fromEntries(columns.map((name) => [name, book.episodes[name][row]])));
     all.forEach((episode) => { episode.about = book.instances[episode.instance]; episode.policyName = book.policies[episode.policy]; });
-    const controls = Object.fromEntries(["task", "target", "policy", "outcome", "kind", "text"].map((name) => [name, document.getElementById(`filter-${name}`)]));
+    const controls = Object.fromEntries(["task", "robot", "target", "policy", "outcome", "kind", "text"].map((name) => [name, document.getElementById(`filter-${name}`)]));
     const distinct = (values) => [...new Set(values.filter(Boolean))].sort();
     options(controls.task, "all tasks", distinct(book.instances.map((item) => item.task)));
+    options(controls.robot, "all robots", distinct(book.instances.map((item) => item.robot)));
     const targets = distinct(book.instances.map((item) => item.target));
     options(controls.target, "anything", targets, targets.map(plain));
     options(controls.policy, "all policies", book.policies);
@@ -163,6 +164,7 @@
     function fits(episode) {
       const wanted = controls.outcome.value;
       return (!controls.task.value || episode.about.task === controls.task.value)
+        && (!controls.robot.value || episode.about.robot === controls.robot.value)
         && (!controls.target.value || episode.about.target === controls.target.value)
         && (!controls.policy.value || episode.policyName === controls.policy.value)
         && (!wanted || ended(episode, wanted))
