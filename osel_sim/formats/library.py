@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # importing pydantic and building the models takes longer tha
     from osel_sim.formats.task_file import TaskSpec
 
 
-def select_tasks(wanted: Sequence[str], extra: Path | None = None) -> list[TaskSpec]:
+def select_tasks(wanted: Sequence[str], extra: Path | None = None) -> "list[TaskSpec]":
     """Our own tasks by name, `tag:TAG` or `all`, each once, in the order asked for. `osel_sim.suites.registry` knows those of other suites, too.
 
     Raises:
