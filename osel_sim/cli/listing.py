@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from osel_sim.core.errors import OselError
 from osel_sim.core.shown import all_shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import TaskSpec, load_task_file
-from osel_sim.suites import GROUP
+from osel_sim.suites import SUITES
 
 
 def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str, list[dict[str, Any]]]:
@@ -27,7 +26,7 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
     return {
         "tasks": [_task(load_task_file(file)) for _, file in sorted(content.files("tasks", tasks).items())],
         "policies": [_policy(load_policy_file(file)) for _, file in sorted(content.files("policies", policies).items())],
-        "suites": [_suite(name) for name in sorted(entry_points(group=GROUP).names)],
+        "suites": [_suite(name) for name in sorted(SUITES)],
     }
 
 

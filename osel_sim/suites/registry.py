@@ -6,25 +6,22 @@ suite's; its value, `module:attribute`, is called without arguments and returns 
 
 import importlib
 from collections.abc import Iterable, Sequence
-from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from osel_sim.core.errors import MissingPackageError, UnknownNameError, UsageError
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.instance import SUITE_SEPARATOR
 from osel_sim.interface.suite import OURS, Suite, Task
-from osel_sim.suites import GROUP
+from osel_sim.suites import SUITES
 
 OURS_LOCATION = "osel_sim.sim.suite", "OurSuite"
 ALL, TAG = "all", "tag"
-RESERVED = (OURS, ALL, TAG, "skill")
-"""Not for suites of others: `skill:` begins the keys of examples among the contexts of instances."""
 LISTING = "python -m osel_sim.run --list"
 
 
 def suite_names() -> list[str]:
     """Names of all suites: ours first."""
-    return [OURS, *sorted(_plugins())]
+    return [OURS, *sorted(SUITES)]
 
 
 def load_suite(name: str, folder: Path | None = None, robot: str | None = None) -> Suite:
@@ -45,18 +42,16 @@ def load_suite(name: str, folder: Path | None = None, robot: str | None = None) 
         return ours
     if robot is not None:
         raise UsageError(f"--robot {robot}: suite {name!r} has robots of its own; the flag is for our tasks")
-    plugin = _plugins().get(name)
-    if plugin is None:
+    if name not in SUITES:
         raise UnknownNameError("suite", name, suite_names(), f"the suite stands before the colon, as in SUITE:TASK; {LISTING}")
+    make, location = SUITES.load(name), SUITES.locations()[name]
     try:
-        suite: Suite = plugin.load()()
+        suite: Suite = make()
         found = suite.spec.name
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(f"suite {name!r}", (error.name or str(error)).partition(".")[0]) from error
     except (AttributeError, ImportError, TypeError) as error:
-        raise UsageError(f"suite {name!r}: {plugin.value} does not make a suite ({type(error).__name__}: {error})") from error
+        raise UsageError(f"suite {name!r}: {location} does not make a suite ({type(error).__name__}: {error})") from error
     if found != name:
-        raise UsageError(f"suite {name!r}: {plugin.value} makes one that calls itself {found!r}")
+        raise UsageError(f"suite {name!r}: {location} makes one that calls itself {found!r}")
     return suite
 
 
@@ -135,8 +130,3 @@ def _split(name: str) -> tuple[str, str]:
     """Suite, and what is asked of it. Only the first colon counts: names of gymnasium's environments may hold one."""
     suite, colon, short = name.partition(SUITE_SEPARATOR)
     return (suite, short) if colon and suite != TAG else (OURS, name)
-
-
-def _plugins() -> dict[str, EntryPoint]:
-    """Suites of others by name; names that mean something else are not theirs to take."""
-    return {plugin.name: plugin for plugin in entry_points(group=GROUP) if plugin.name not in RESERVED}
