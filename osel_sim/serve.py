@@ -20,6 +20,7 @@ from osel_sim.core.trust import trusting
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
 if TYPE_CHECKING:
+    from osel_sim.interface.environment import EnvironmentSpec
     from osel_sim.remote.server import PolicyServer
 
 GRACE_SECONDS = 2.0  # for an inference that is still running when everything else has stopped
@@ -47,6 +48,10 @@ class ServeConfig(TrustSettings):
     """environment variable with the token"""
     policies_dir: Annotated[Folder | None, CONTENT] = None
     """folder with policy files of your own"""
+    task: Annotated[str | None, OTHER] = None
+    """a task that it will drive in, where that is none of ours: SUITE:TASK"""
+    environment: Annotated[str | None, OTHER] = None
+    """what it will drive as JSON, in place of --task (for a program that starts the server)"""
     watch_stdin: Annotated[bool, OTHER] = False
     """stop when standard input ends (for a program that starts the server)"""
 
@@ -75,8 +80,9 @@ def _serve(config: ServeConfig) -> int:
     if given is None and not is_loopback(config.host):
         raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
-    greeting = Greeting.of(spec)
-    make_session = session_factory(spec)
+    environment = _environment(config)
+    greeting = Greeting.of(spec, environment)
+    make_session = session_factory(spec, environment)
     warm_up(make_session, greeting)
     server = PolicyServer(make_session, greeting, token, config.host, config.port)
 
@@ -87,6 +93,24 @@ def _serve(config: ServeConfig) -> int:
 
     _run_until_signal(server, ready)
     return 0
+
+
+def _environment(config: ServeConfig) -> "EnvironmentSpec":
+    """What the policy will drive: as given, or as a task has it, or any of our own."""
+    from osel_sim.interface.environment import EnvironmentSpec
+
+    if config.environment is not None:
+        try:
+            return EnvironmentSpec.from_dict(json.loads(config.environment))
+        except ValueError as error:
+            raise SettingError("environment", f"is not JSON ({error})") from None
+    if config.task is not None:
+        from osel_sim.suites.registry import find_task
+
+        return find_task(config.task).specification
+    from osel_sim.sim.specification import specification
+
+    return specification()
 
 
 class _Formatter(logging.Formatter):

@@ -203,11 +203,12 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.episodes.drivers import choose_policies
     from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
+    from osel_sim.sim.specification import specification
 
     start = time.perf_counter()
     if not config.dataset:
         raise SettingError("dataset", "is missing: give the folder of a LeRobotDataset")
-    specs = choose_policies(config.policies, config.policies_dir)
+    specs = choose_policies(config.policies, specification(), config.policies_dir)
     cameras = {}
     for item in config.camera or ():
         camera, equals, column = item.partition("=")

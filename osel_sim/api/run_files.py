@@ -1,10 +1,7 @@
-"""What a live run writes when it ends: summary, learning curve, the selector's state, the page."""
+"""What a live run writes when it ends: summary, learning curve, the selector's state."""
 
 import logging
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from osel_sim.core.errors import OselError
 
 if TYPE_CHECKING:
     from osel_sim.episodes.live import LiveRun
@@ -12,12 +9,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-def write_results(live: "LiveRun", title: str, selector: str) -> tuple[dict[str, Any], Path | None]:
-    """Write them.
-
-    Returns:
-        the summary, and the page or None where it could not be written; both empty where no decision was made.
-    """
+def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
+    """Write them. Returns the summary, empty where no decision was made."""
     from osel_sim.core.files import write_json
     from osel_sim.figures import learning_curve
     from osel_sim.formats.summary import summarise
@@ -25,7 +18,7 @@ def write_results(live: "LiveRun", title: str, selector: str) -> tuple[dict[str,
 
     if not live.decisions:
         logger.warning("no decision was made")
-        return {}, None
+        return {}
     policies = live.selector.policies
     chosen = [policies.index(decision.policy) for decision in live.decisions]
     summary = {"task": title, **summarise(live.decisions, policies, selector)}
@@ -34,18 +27,7 @@ def write_results(live: "LiveRun", title: str, selector: str) -> tuple[dict[str,
     write_json(live.folder / "summary.json", summary)
     save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
     learning_curve(live.folder / "curve.png", f"{title}, {len(chosen)} decisions", selector, policies, chosen, live.rewards)
-    return summary, _page(live.folder)
-
-
-def _page(folder: Path) -> Path | None:
-    from osel_sim.reporting.page import write_page
-    from osel_sim.reporting.run_page import run_page
-
-    try:
-        return write_page(run_page(folder), folder)
-    except OselError as problem:  # the run itself is complete; python -m osel_sim.report tries again
-        logger.warning("no report.html: %s", problem)
-        return None
+    return summary
 
 
 def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:

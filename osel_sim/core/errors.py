@@ -33,6 +33,13 @@ class UnknownNameError(UsageError):
         super().__init__(f"unknown {what} {name!r}: {did_you_mean(name, known)}{listing}")
 
 
+class MissingPackageError(UsageError):
+    """Something was asked for that needs a package which is not installed."""
+
+    def __init__(self, what: str, package: str, install: str = "") -> None:
+        super().__init__(f"{what} needs the package {package!r}, which is not installed: {install or f'pip install {package}'}")
+
+
 class ContentError(OselError):
     """A task, policy or other TOML file is wrong. The message has a line for each fault: the file, the key and what would be right.
 

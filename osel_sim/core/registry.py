@@ -32,6 +32,10 @@ class Registry[T]:
         """Name -> `module:attribute` of all there are."""
         return {name: points[0].value for name, points in self._plugins().items()} | dict(self._built_in)
 
+    def others(self) -> list[str]:
+        """Names of those that other packages bring, sorted."""
+        return sorted(name for name in self._plugins() if name not in self._built_in)
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.locations())
 

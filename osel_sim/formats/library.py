@@ -13,10 +13,10 @@ if TYPE_CHECKING:  # importing pydantic and building the models takes longer tha
 
 
 def select_tasks(wanted: Sequence[str], extra: Path | None = None) -> "list[TaskSpec]":
-    """Tasks by name, `tag:TAG` or `all`, each once, in the order asked for.
+    """Our own tasks by name, `tag:TAG` or `all`, each once, in the order asked for. `osel_sim.suites.registry` knows those of other suites, too.
 
     Raises:
-        UsageError: nothing is asked for.
+        UsageError: nothing is asked for, or a task of another suite.
         UnknownNameError: with the nearest known name or tag.
         ContentError: a task file is wrong.
     """
@@ -27,6 +27,8 @@ def select_tasks(wanted: Sequence[str], extra: Path | None = None) -> "list[Task
     chosen: dict[str, TaskSpec] = {}
     for name in wanted:
         kind, colon, tag = name.partition(":")
+        if colon and kind != "tag":
+            raise UsageError(f"task {name!r} is of the suite {kind!r}; only osel_sim's own tasks can be used here (python -m osel_sim.run --list)")
         if name == "all" or (colon and kind == "tag"):
             everything = [load_task_file(file) for _, file in sorted(content.files("tasks", extra).items())]
             found = [task for task in everything if name == "all" or tag in task.tags]

@@ -14,11 +14,10 @@ from osel_sim.formats.toml_file import load_toml
 from osel_sim.formats.toml_types import TABLE, FileName, OneOf, Texts, Version, between, quoted, refuse
 
 NETWORKS = ("none", "ethernet", "wifi", "lte", "satellite")  # the profiles themselves: osel_sim.remote.network
-CAMERAS = ("agentview", "wrist")
 MODES = ("blocking", "async")
 PRIVILEGED = ("scripted_expert",)
 """Kinds that see the simulator's state: a ceiling to compare with, never chosen unless named, and never behind a server."""
-_CAMERAS_WANTED = f"must name one or more different cameras of {', '.join(CAMERAS)}, "
+_CAMERAS_WANTED = "must name one or more different cameras, "
 
 Cents = Annotated[float, between(0.0, 1e6)]
 
@@ -69,7 +68,7 @@ class Remote:
 class ObservationTable:
     """What a policy is shown."""
 
-    cameras: tuple[Annotated[str, OneOf(CAMERAS)], ...]
+    cameras: Texts
     """Different cameras, one or more."""
     image_size: Annotated[int, between(16, 1024)]
     """Pixels of each side: images are square."""
@@ -99,7 +98,8 @@ class _Keys:
     inference_seconds: Annotated[float, between(0.0, 3600.0)]
     """Declared time of one inference on the virtual clock."""
     skills: Texts | None = None
-    """Tasks that it was made for (names, `tag:TAG` or `all`), for selectors that want to know; left out: nothing is said."""
+    """Tasks that it was made for (names, `tag:TAG`, `all`, and `SUITE:` before them for those of other suites), for selectors that want to know; left
+    out: nothing is said."""
     price: Price = field(default_factory=Price)
     """What it costs; left out: nothing."""
 
