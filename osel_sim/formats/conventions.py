@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import field
 from typing import Annotated
 
+from pydantic import AfterValidator, ValidationInfo
 from pydantic.dataclasses import dataclass
 
 from osel_sim.formats.toml_types import TABLE, Faults, Number, OneOf, Switch, Texts, between, quoted, unknown_value
@@ -15,6 +16,12 @@ GRIPPERS = ("closed_positive", "open_positive", "closed_one", "open_one")
 """What the gripper's number means: 1 closed and -1 open (as robosuite and LIBERO have it), 1 open and -1 closed, 1 closed and 0 open, 1 open and 0
 closed."""
 ENVIRONMENT_STATES = ("hashed_text",)
+
+
+def _some(columns: tuple[int, ...], info: ValidationInfo) -> tuple[int, ...]:
+    if info.context is not None and not columns:  # in a file: whoever writes the key wants to say something by it
+        raise ValueError("must be column numbers of an action, counted from 0, got []")
+    return columns
 
 
 @dataclass(frozen=True, config=TABLE)
@@ -33,7 +40,7 @@ class Conventions:
     """Key of the instruction."""
     actions: str = "actions"
     """Key of the answer's actions (openpi only)."""
-    columns: tuple[Annotated[int, between(0, 999)], ...] = ()
+    columns: Annotated[tuple[Annotated[int, between(0, 999)], ...], AfterValidator(_some)] = ()
     """Which of an action's numbers are the motions and the gripper, counted from 0; empty: it has just those."""
     gripper: Annotated[str, OneOf(GRIPPERS)] = "closed_positive"
     """What the gripper's number means: 1 closed and -1 open, 1 open and -1 closed, 1 closed and 0 open, 1 open and 0 closed."""

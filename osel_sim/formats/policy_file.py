@@ -98,7 +98,8 @@ class _Keys:
     inference_seconds: Annotated[float, between(0.0, 3600.0)]
     """Declared time of one inference on the virtual clock."""
     skills: Texts | None = None
-    """Tasks that it was made for (names, `tag:TAG` or `all`), for selectors that want to know; left out: nothing is said."""
+    """Tasks that it was made for (names, `tag:TAG`, `all`, and `SUITE:` before them for those of other suites), for selectors that want to know; left
+    out: nothing is said."""
     price: Price = field(default_factory=Price)
     """What it costs; left out: nothing."""
 
