@@ -103,6 +103,7 @@ def test_the_example_files_are_right(file: Path) -> None:
     [
         ('images = { agentvie = "image" }', "mapping.images.agentvie: unknown value 'agentvie', did you mean 'agentview'?"),
         ('gripper = "open_is_one"', "mapping.gripper: unknown value 'open_is_one', did you mean 'open_one'?"),
+        ("columns = []", "mapping.columns: must be column numbers"),
         ('prompt = "observation.state"', "two inputs have the name 'observation.state'"),
         ('sate = "x"', "mapping.sate: is not a known key, did you mean 'state'?"),
     ],
