@@ -5,12 +5,12 @@ Listing names imports nothing; a name is imported when it is loaded.
 
 import functools
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
-from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.core.errors import MissingPackageError, OselError, UnknownNameError, UsageError
 
 
 class Registry[T]:
@@ -21,12 +21,12 @@ class Registry[T]:
         group: entry-point group in which other packages offer more. They cannot replace a built-in one.
         built_in: name -> `module:attribute`.
         kind: what a loaded one must be an instance of; None: anything.
+        reserved: names that mean something else, and are not for other packages to take.
     """
 
-    def __init__(self, what: str, group: str, built_in: Mapping[str, str], kind: type[T] | None = None) -> None:
+    def __init__(self, what: str, group: str, built_in: Mapping[str, str], kind: type[T] | None = None, reserved: Collection[str] = ()) -> None:
         self.what, self.group = what, group
-        self._built_in, self._kind = built_in, kind
-        self._loaded: dict[str, T] = {}
+        self._built_in, self._kind, self._reserved = built_in, kind, reserved
 
     def locations(self) -> dict[str, str]:
         """Name -> `module:attribute` of all there are."""
@@ -50,15 +50,14 @@ class Registry[T]:
 
         Raises:
             UnknownNameError: there is none of that name.
+            MissingPackageError: it needs a package that is not installed.
             UsageError: it cannot be imported, is of another kind, or two packages offer it; names the package and the cause.
         """
         if name in self._built_in:
             location, source = self._built_in[name], ""
         else:
             location, source = self._location(name, where)
-        if location not in self._loaded:
-            self._loaded[location] = self._import(name, location, source)
-        return self._loaded[location]
+        return self._import(name, location, source)
 
     def _location(self, name: str, where: str) -> tuple[str, str]:
         """Where a plugin lies, and whose it is."""
@@ -73,6 +72,10 @@ class Registry[T]:
         module, _, attribute = location.partition(":")
         try:
             found: Any = functools.reduce(getattr, attribute.split("."), import_module(module))
+        except OselError:
+            raise
+        except ModuleNotFoundError as error:
+            raise MissingPackageError(f"{self.what} {name!r}{source}", (error.name or str(error)).partition(".")[0]) from error
         except Exception as error:  # a plugin may raise anything while it is imported
             raise UsageError(f"{self.what} {name!r}{source}: cannot import {location} ({type(error).__name__}: {error})") from error
         if self._kind is not None and not isinstance(found, self._kind):
@@ -80,7 +83,7 @@ class Registry[T]:
         return cast(T, found)
 
     def _plugins(self) -> dict[str, list[EntryPoint]]:
-        return _plugins(self.group, tuple(sys.path))
+        return {name: points for name, points in _plugins(self.group, tuple(sys.path)).items() if name not in self._reserved}
 
 
 @functools.lru_cache

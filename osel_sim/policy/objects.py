@@ -57,8 +57,9 @@ def as_policy(
     for method in ("reset", "act"):
         if not callable(getattr(policy, method, None)):
             raise UsageError(f"policy {type(policy).__name__!r} has no method {method!r}; a policy has reset(instruction) and act(observation)")
-    if image_size < 16 or execute < 1 or inference_seconds < 0 or price_per_action < 0:
-        raise UsageError("a policy's image_size must be 16 or more, execute 1 or more, inference_seconds and price_per_action 0 or more")
+    if not (16 <= image_size <= 1024 and 1 <= execute <= 1000 and 0 <= inference_seconds <= 3600 and 0 <= price_per_action <= 1e6):
+        ranges = "image_size in [16, 1024], execute in [1, 1000], inference_seconds in [0, 3600] and price_per_action in [0, 1000000]"
+        raise UsageError(f"a policy's numbers must lie in these ranges, as in a policy file: {ranges}")
     kind = type(policy)
     name = name or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower()
     spec = PolicySpec(

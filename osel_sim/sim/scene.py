@@ -11,7 +11,7 @@ from typing import Any
 
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError
-from osel_sim.formats.task_file import Entity
+from osel_sim.formats.catalogue import Entity
 from osel_sim.interface.robot import Robot
 
 TABLE_HEIGHT = 0.8
