@@ -27,7 +27,7 @@ class DoctorConfig(ContentSettings):
     policy: Annotated[str | None, MAIN] = None
     """name or file of a policy: run one instance with it and report on it"""
     task: Annotated[str, MAIN] = "pick_place"
-    """task of that instance, also SUITE:TASK"""
+    """task of that instance; of other suites SUITE:TASK"""
     seed: Annotated[Index, MAIN] = 0
     """seed of that instance"""
     level: Annotated[Index, MAIN] = 0

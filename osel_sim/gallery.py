@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from osel_sim.api.settings import CONTENT, MAIN, Count, Folder, Index, Names, Settings, settings
 from osel_sim.cli.command import Command
-from osel_sim.core.errors import SettingError, UnknownNameError, UsageError
+from osel_sim.core.errors import SettingError, UnknownNameError
 from osel_sim.core.files import write_bytes
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class GalleryConfig(Settings):
     size: Annotated[Count, MAIN] = 256
     """pixels of a picture, square"""
     camera: Annotated[str | None, MAIN] = None
-    """agentview or wrist; other suites have others (default: the one that encoders are shown)"""
+    """which camera, such as wrist (default: the one that encoders are shown)"""
     robot: Annotated[str | None, MAIN] = None
     """robot that stands there, such as UR5e (default: the one each task file names, else Panda)"""
     tasks: Annotated[Folder | None, CONTENT] = None
@@ -55,9 +55,9 @@ class GalleryConfig(Settings):
 def _execute(config: GalleryConfig) -> int:
     from osel_sim.suites.registry import ALL, select_tasks
 
-    tasks = select_tasks(config.task or [ALL], config.tasks, config.robot)
     if config.out is None or config.out.suffix.lower() != ".png":
         raise SettingError("out", "is missing: give the .png to write" if config.out is None else f"{config.out} must end in .png")
+    tasks = select_tasks(config.task or (ALL,), config.tasks, config.robot)
     if config.each_axis and len(tasks) != 1:
         raise SettingError("each_axis", f"shows one task: give --task with one of {', '.join(task.name for task in tasks)}")
     picture = _sheet(config, tasks)
@@ -76,8 +76,8 @@ def _sheet(config: GalleryConfig, tasks: "Sequence[Task]") -> "NDArray[np.uint8]
     levels = sorted({level for task in tasks for level in task.suite.spec.levels})
     rows: list[NDArray[np.uint8]] = []
     for task in tasks:
-        if config.camera is not None and config.camera not in task.specification.cameras:
-            raise UnknownNameError("camera", config.camera, task.specification.cameras, f"--camera; task {task.name}")
+        if config.camera not in (None, *task.specification.cameras):
+            raise UnknownNameError("camera", config.camera or "", task.specification.cameras, f"--camera; task {task.name}")
         own = [level if level in task.suite.spec.levels else None for level in levels]
         with contextlib.closing(task.open()) as env:
             if config.each_axis:
@@ -86,7 +86,7 @@ def _sheet(config: GalleryConfig, tasks: "Sequence[Task]") -> "NDArray[np.uint8]
             else:
                 rows.append(_row(config, task, env, task.name, own))
     if not rows:
-        raise UsageError(f"--each-axis: task {tasks[0].name} has no axes")
+        raise SettingError("each_axis", f"task {tasks[0].name} has no axes")
     header = np.full((HEADER, rows[0].shape[1], 3), PAPER, np.uint8)
     for column, level in enumerate(levels):
         _write(header, f"level {level}", (MARGIN + column * config.size + 6, 18), INK, 0.5)

@@ -26,7 +26,7 @@ EXAMPLES = """examples:
   python -m osel_sim.ingest --metric action-mse --dataset data/bridge data/fractal --policies local_small remote_large --out logs/oxe
 
 Writes rollouts.parquet and contexts.npz into --out, nothing if the table is wrong. The same command goes on with an interrupted encoding, and another
---encoder adds its contexts to the log. How a mapping file looks: the top of osel_sim/ingestion/mapping.py."""
+--encoder adds its contexts to the log. How a mapping file looks: the top of osel_sim/ingestion/columns.py."""
 
 
 def _execute(config: IngestConfig) -> int:

@@ -48,10 +48,10 @@ class ServeConfig(TrustSettings):
     """environment variable with the token"""
     policies_dir: Annotated[Folder | None, CONTENT] = None
     """folder with policy files of your own"""
-    task: Annotated[str | None, MAIN] = None
+    task: Annotated[str | None, OTHER] = None
     """a task that it will drive in, where that is none of ours: SUITE:TASK"""
     environment: Annotated[str | None, OTHER] = None
-    """JSON of what it will drive, in place of --task (for a program that starts the server)"""
+    """what it will drive as JSON, in place of --task (for a program that starts the server)"""
     watch_stdin: Annotated[bool, OTHER] = False
     """stop when standard input ends (for a program that starts the server)"""
 
@@ -103,7 +103,7 @@ def _environment(config: ServeConfig) -> "EnvironmentSpec":
         try:
             return EnvironmentSpec.from_dict(json.loads(config.environment))
         except ValueError as error:
-            raise SettingError("environment", f"not JSON ({error})") from None
+            raise SettingError("environment", f"is not JSON ({error})") from None
     if config.task is not None:
         from osel_sim.suites.registry import find_task
 

@@ -23,7 +23,7 @@ from osel_sim.core import content
 from osel_sim.core.errors import CheckpointError, ContentError, PolicyError, RemoteError, UsageError
 from osel_sim.episodes.drivers import choose_policies
 from osel_sim.formats import library
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.mapping import actions_of, message_of, orientation, state_of, state_size
@@ -47,10 +47,10 @@ def observation(**changes: Any) -> dict[str, Any]:
 def test_a_state_is_put_together_from_its_parts() -> None:
     parts = ("position", "quaternion", "gripper")
     half = np.sqrt(0.5)
-    assert state_of(observation(), Mapping(state_parts=parts), ROBOT) == pytest.approx([0.1, 0.2, 1.0, half, 0, 0, half, 1.0])
-    assert state_of(observation(), Mapping(state_parts=("euler",)), ROBOT) == pytest.approx([np.pi / 2, 0, 0])
-    assert np.array_equal(state_of(observation(), Mapping(), ROBOT), STATE)
-    assert state_size(Mapping(state_parts=parts), ROBOT) == 8
+    assert state_of(observation(), Conventions(state_parts=parts), ROBOT) == pytest.approx([0.1, 0.2, 1.0, half, 0, 0, half, 1.0])
+    assert state_of(observation(), Conventions(state_parts=("euler",)), ROBOT) == pytest.approx([np.pi / 2, 0, 0])
+    assert np.array_equal(state_of(observation(), Conventions(), ROBOT), STATE)
+    assert state_size(Conventions(state_parts=parts), ROBOT) == 8
 
 
 def test_rotations_agree_with_another_implementation(recwarn: pytest.WarningsRecorder) -> None:
@@ -75,17 +75,17 @@ def test_every_gripper_convention_ends_in_ours(gripper: str, opened: float, clos
     chunk = np.zeros((2, 7))
     chunk[:, 6] = opened, closed
     chunk[:, 0] = 0.01
-    actions = actions_of(chunk, Mapping(gripper=gripper, scale=(20.0, 20.0, 20.0, 2.0, 2.0, 2.0)), ROBOT.action)
+    actions = actions_of(chunk, Conventions(gripper=gripper, scale=(20.0, 20.0, 20.0, 2.0, 2.0, 2.0)), ROBOT.action)
     assert actions[:, 6].tolist() == [-1, 1] and actions[:, 0] == pytest.approx(0.2)
 
 
 def test_columns_are_picked_and_a_wrong_width_is_explained() -> None:
     wide = np.arange(32.0)[None].repeat(3, axis=0)
-    assert actions_of(wide, Mapping(columns=(0, 1, 2, 3, 4, 5, 7)), ROBOT.action)[0].tolist() == [0, 1, 2, 3, 4, 5, 7]
+    assert actions_of(wide, Conventions(columns=(0, 1, 2, 3, 4, 5, 7)), ROBOT.action)[0].tolist() == [0, 1, 2, 3, 4, 5, 7]
     with pytest.raises(PolicyError, match=r"shape \(3, 32\), the robot takes \(T, 7\).*columns"):
-        actions_of(wide, Mapping(), ROBOT.action)
+        actions_of(wide, Conventions(), ROBOT.action)
     with pytest.raises(PolicyError, match=r"columns = .* needs more"):
-        actions_of(np.zeros(6), Mapping(columns=(0, 1, 2, 3, 4, 5, 6)), ROBOT.action)
+        actions_of(np.zeros(6), Conventions(columns=(0, 1, 2, 3, 4, 5, 6)), ROBOT.action)
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -158,7 +158,7 @@ def save_act(folder: Path, state: int = 8, action: int = 7, statistics: bool = T
 def spec_of(folder: Path, **mapping: Any) -> Any:
     given = {"images": {"agentview": "observation.images.image", "wrist": "observation.images.image2"}} | mapping
     local = library.load_policy("local_small")
-    return dataclasses.replace(local, cameras=("agentview", "wrist"), image_size=SIZE, checkpoint=str(folder), mapping=Mapping(**given))
+    return dataclasses.replace(local, cameras=("agentview", "wrist"), image_size=SIZE, checkpoint=str(folder), mapping=Conventions(**given))
 
 
 @pytest.fixture(scope="module")

@@ -89,7 +89,18 @@ class Steps(Subscriber):
 
 def spec(name="p", mode=None, execute=8, price=PRICE):
     remote = None if mode is None else Remote(mode=mode)
-    return PolicySpec(name, name, "test", "", ("agentview",), 32, execute, 0.01, remote, price, Path("p.toml"))
+    return PolicySpec(
+        name=name,
+        title=name,
+        kind="test",
+        cameras=("agentview",),
+        image_size=32,
+        execute=execute,
+        inference_seconds=0.01,
+        remote=remote,
+        price=price,
+        file=Path("p.toml"),
+    )
 
 
 @pytest.fixture(scope="module")

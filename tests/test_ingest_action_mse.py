@@ -113,6 +113,6 @@ def test_bad_datasets_get_one_line(dataset, tmp_path, capsys):
     assert ingest_main([*flags, "--camera", "wrist"]) == 2
     assert ingest_main([*flags, "--camera", "wrist=observation.images.wrist"]) == 2
     error = capsys.readouterr().err
-    assert "--camera must be CAMERA=COLUMN, got 'wrist'" in error
+    assert "--camera: must be CAMERA=COLUMN, got 'wrist'" in error
     assert "--camera wrist: no policy has that camera" in error
     assert not (tmp_path / "log").exists()

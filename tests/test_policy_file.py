@@ -66,7 +66,7 @@ def test_a_local_policy_needs_no_remote_and_no_price(tmp_path: Path) -> None:
         ("execute = 8", "execute = 0", "execute: must lie in [1, 1000], got 0"),
         ("execute = 8", "execute = 8.5", "execute: must be an integer, got 8.5"),
         ("execute = 8", "execute = true", "execute: must be an integer, got True"),
-        ("execute = 8", "exekute = 8", "execute: is missing, expected an integer"),
+        ("execute = 8", "exekute = 8", "exekute: is not a known key, did you mean 'execute'?"),
         ("inference_seconds = 0.1", "inference_seconds = -1", "inference_seconds: must lie in [0.0, 3600.0], got -1.0"),
         ("inference_seconds = 0.1", "inference_seconds = nan", "inference_seconds: must lie in [0.0, 3600.0], got nan"),
         ('["agentview", "wrist"]', '"agentview"', "observation.cameras: must be a list, got 'agentview'"),

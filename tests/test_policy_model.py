@@ -17,7 +17,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_TOKENS, 
 from osel_sim.core.errors import CheckpointError
 from osel_sim.core.torch_settings import threads
 from osel_sim.formats import library
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
 from osel_sim.policy.language_chunk import LanguageChunkConfig, LanguageChunkPolicy, make_language_chunk_pre_post_processors
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.processing import area_weights, rotation_columns
@@ -199,7 +199,7 @@ def test_lerobots_own_act_loads_and_reads_the_instruction(tmp_path: Path) -> Non
         pipeline.save_pretrained(tmp_path)
     with pytest.raises(CheckpointError, match=r'environment_state says what it is \(known: "hashed_text"\)'):
         act(tmp_path)
-    reads = Mapping(environment_state="hashed_text")
+    reads = Conventions(environment_state="hashed_text")
     one, other = act(tmp_path, mapping=reads), act(tmp_path, "put the milk in the tray", mapping=reads)
     assert one.shape == (10, 7)
     assert not np.array_equal(one, other)

@@ -319,6 +319,20 @@ def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
     assert (before != after).any(axis=1).all()
 
 
+@pytest.mark.slow
+def test_another_robot_is_recorded_and_stays_that_of_the_recording(world, reference, capsys):
+    folder = world / "ur5e"
+    assert execute(world, "record", "--instances", 1, "--robot", "UR5e", "--workers", 1, "--out", folder).returncode == 0
+    rows, metadata = read_rollouts(folder)
+    assert {(row.instance, row.robot) for row in rows} == {("short/test/0/0-UR5e", "UR5e")}
+    assert (metadata["robot"], metadata["schema_version"]) == ("UR5e", 3)
+    assert read_rollouts(reference[0])[1]["schema_version"] == 2
+    before = files(folder)
+    assert resume(world, folder).returncode == 0 and files(folder) == before
+    assert record_main(["--resume", "--out", str(folder), "--robot", "Panda"]) == 2
+    assert "--robot Panda: " in (text := capsys.readouterr().err) and "began with UR5e" in text
+
+
 def test_summary_of_a_log(reference, capsys):
     assert record_main(["--summary", str(reference[0])]) == 0
     output = capsys.readouterr().out
@@ -346,6 +360,7 @@ def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
         (["--level", "17"], "unknown level 17"),
         (["--axis", "camra=2"], "did you mean 'camera'?"),
         (["--axis", "camera"], "must read AXIS=LEVEL"),
+        (["--robot", "UR5"], "did you mean 'UR5e'?"),
         (["--resume"], "there is no run in"),
     ],
 )

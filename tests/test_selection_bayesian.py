@@ -223,7 +223,18 @@ def test_features_keep_what_matters():
 
 
 def spec(name: str, execute: int = 8, remote=None, **price):
-    return PolicySpec(name, name, "lerobot", "", ("agentview",), 96, execute, 0.02, remote, Price(**price), Path(f"{name}.toml"))
+    return PolicySpec(
+        name=name,
+        title=name,
+        kind="lerobot",
+        cameras=("agentview",),
+        image_size=96,
+        execute=execute,
+        inference_seconds=0.02,
+        remote=remote,
+        price=Price(**price),
+        file=Path(f"{name}.toml"),
+    )
 
 
 def test_costs_declared_by_policy_files():

@@ -11,14 +11,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import osel_sim
 from osel_sim.core.errors import ContentError, MissingPackageError, UnknownNameError, UsageError
 from osel_sim.episodes.drivers import Drivers, choose_policies, left_out
 from osel_sim.episodes.live import LiveOptions, LiveRun
 from osel_sim.episodes.loop import Driver, Subscriber, run_episode
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
+from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.journal import read_journal
-from osel_sim.formats.mapping import Mapping
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.formats.rollout_log import DECLARED, read_rollouts
 from osel_sim.interface.call import Call
@@ -76,45 +77,53 @@ def test_unknown_names_get_the_nearest(name, message):
         select_tasks([name])
 
 
-def write_suite(folder: Path, module: str) -> None:
-    """A package `broken` with one suite of that name."""
-    info = folder / "broken-1.0.dist-info"
+def write_suite(folder: Path, module: str) -> str:
+    """A package with one suite, whose name is given."""
+    name = f"broken_{folder.name}"
+    info = folder / f"{name}-1.0.dist-info"
     info.mkdir()
-    (folder / "broken_suite.py").write_text(module)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[osel_sim.suites]\nbroken = broken_suite:Broken\n")
+    (folder / f"{name}.py").write_text(module.replace("NAME", name))
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(f"[osel_sim.suites]\n{name} = {name}:Broken\n")
+    return name
 
 
 def test_a_missing_package_is_named_with_the_command_that_gets_it(tmp_path, monkeypatch):
-    write_suite(
+    name = write_suite(
         tmp_path,
         "from osel_sim.interface.suite import SuiteSpec, TaskInfo\n"
         "class Broken:\n"
-        "    spec = SuiteSpec('broken', 'Needs what is not there', install='pip install broken[simulator]')\n"
+        "    spec = SuiteSpec('NAME', 'Needs what is not there', install='pip install broken[simulator]')\n"
         "    tasks = {'one': TaskInfo('One', 10, '1')}\n"
         "    def open(self, task):\n"
         "        import no_such_simulator.core\n",
     )
     monkeypatch.syspath_prepend(str(tmp_path))
-    needs = r"suite 'broken' needs the package 'no_such_simulator', which is not installed: pip install broken\[simulator\]"
+    needs = rf"suite '{name}' needs the package 'no_such_simulator', which is not installed: pip install broken\[simulator\]"
     with pytest.raises(MissingPackageError, match=needs):
-        find_task("broken:one").open()
+        find_task(f"{name}:one").open()
 
 
 @pytest.mark.parametrize(
     ("module", "error", "message"),
     [
         ("import no_such_simulator\n", MissingPackageError, "needs the package 'no_such_simulator'.*pip install no_such_simulator"),
-        ("Broken = 3\n", UsageError, "'broken': broken_suite:Broken does not make a suite"),
+        ("Broken = 3\n", UsageError, ":Broken makes no suite"),
         ("from toy_suite import Toy as Broken\n", UsageError, "makes one that calls itself 'toy'"),
     ],
 )
 def test_a_suite_that_cannot_be_loaded_says_why(module, error, message, tmp_path, monkeypatch):
-    write_suite(tmp_path, module)
+    name = write_suite(tmp_path, module)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "broken_suite", raising=False)
     with pytest.raises(error, match=message):
-        find_task("broken:one")
+        find_task(f"{name}:one")
+
+
+def test_other_suites_have_their_own_robot():
+    assert find_task("lift", robot="UR5e").robot == "UR5e" and find_task("lift").specification.robot == "Panda"
+    assert find_task("lift", robot="UR5e").instance(0).key == "lift/test/0/0-UR5e"
+    with pytest.raises(UsageError, match="suite 'toy' has its own robot: leave --robot out"):
+        find_task("toy:reach", robot="UR5e")
 
 
 def test_what_a_suite_does_not_have_is_refused_by_name():
@@ -225,26 +234,31 @@ def test_without_names_policies_of_other_suites_are_left_out():
     ],
 )
 def test_conventions_are_checked_against_the_environment(conventions, key, problem):
-    spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), mapping=Mapping(**conventions))
+    spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), mapping=Conventions(**conventions))
     ((found, words),) = misfits(spec, find_task("toy:reach").specification)
     assert found == key and problem in words
 
 
-def test_an_entry_point_that_takes_no_environment_is_told_so(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("arguments", "works"), [("spec, environment", True), ("spec", True), ("", False), ("spec, environment, more", False)])
+def test_a_kind_is_told_what_it_drives_if_it_wants_to_know(arguments, works, tmp_path, monkeypatch):
     info = tmp_path / "old-1.0.dist-info"
     info.mkdir()
-    (tmp_path / "old_policies.py").write_text("def load(spec):\n    return lambda: None\n")
+    name = f"policies_with_{len(arguments)}"
+    (tmp_path / f"{name}.py").write_text(f"def load({arguments}):\n    return lambda: None\n")
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: old\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[osel_sim.policies]\nold = old_policies:load\n")
+    (info / "entry_points.txt").write_text(f"[osel_sim.policies]\nold = {name}:load\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), kind="old")
+    spec, environment = replace(load_policy_file(POLICIES / "toy_greedy.toml"), kind="old"), find_task("toy:reach").specification
+    if works:
+        assert session_factory(spec, environment)() is None
+        return
     with pytest.raises(UsageError, match=r"kind 'old': its entry point must be a function load\(spec, environment\)"):
-        session_factory(spec, find_task("toy:reach").specification)
+        session_factory(spec, environment)
 
 
 def test_quaternions_are_computed_of_an_axis_angle_and_not_known_without():
     spec = load_policy_file(POLICIES / "toy_greedy.toml")
-    wants = replace(spec, cameras=("wrist",), mapping=Mapping(state_parts=("quaternion", "gripper")))
+    wants = replace(spec, cameras=("wrist",), mapping=Conventions(state_parts=("quaternion", "gripper")))
     assert not list(misfits(wants, specification()))
     assert [key for key, _ in misfits(replace(wants, cameras=("top",)), find_task("toy:reach").specification)] == ["mapping.state_parts"] * 2
 
@@ -441,6 +455,24 @@ def test_subscribers_are_told_of_a_run_and_one_that_fails_leaves_it_whole(tmp_pa
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
     decisions = read_journal(tmp_path / "whole" / "episodes.jsonl")
     assert {decision.task for decision in decisions} <= {"toy:reach", "toy:hurry"}
+
+
+@pytest.mark.slow
+def test_from_python_a_run_of_another_suite_is_watched_and_driven_by_an_object_at_hand(tmp_path):
+    class East:
+        def reset(self, instruction):
+            self.seen = set()
+
+        def act(self, observation):
+            self.seen |= observation.keys()
+            return np.ones((30, 2), np.float32)
+
+    east, told = East(), Told()
+    names = [east, "scripted_expert"]
+    result = osel_sim.run(task="toy:reach", policies=names, selector="fixed:east", episodes=2, out=tmp_path / "run", subscribers=[told])
+    assert east.seen == {"observation.images.top", "observation.state", "task"}
+    assert [decision.policy for decision in result.journal] == ["east"] * 2 and result.page is not None and result.page.is_file()
+    assert [event for event in told.heard if event[0] == "decision"] == [("decision", 0, 1), ("decision", 1, 1)]
 
 
 # -- commands ----------------------------------------------------------------------------------------------------------

@@ -60,7 +60,7 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
     """
     from osel_sim.formats.levels import parse_axes, resolve
     from osel_sim.formats.library import select_tasks
-    from osel_sim.interface.robot import DEFAULT_ROBOT
+    from osel_sim.formats.run_config import robots_said
     from osel_sim.sim.robots import with_robot
     from osel_sim.training import collection
 
@@ -78,7 +78,7 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
     done = []
     for task, out in zip(tasks, outs, strict=True):
         kind = {"task": task.name, "task_version": task.version, "levels": list(config.level), "axes": axes, "image_size": config.image_size}
-        kind |= {"robot": None if task.robot == DEFAULT_ROBOT else task.robot}
+        kind |= {"robot": None, **robots_said([task])}
         collection.check_settings(collection.shards_folder(out), kind)
         if collection.seeds(out) == config.episodes:
             done.append(f"{out} is complete")  # and stays as it is: training tells datasets apart by when their files were written, too

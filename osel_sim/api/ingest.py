@@ -12,13 +12,13 @@ from osel_sim.api.results import frame
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Folder, Group, Names, NonNegative, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UsageError
 from osel_sim.core.trust import trusting
-from osel_sim.ingestion.mapping import VALUES
+from osel_sim.ingestion.columns import VALUES
 
 if TYPE_CHECKING:
     import pandas
 
     from osel_sim.formats.rollout_log import Row
-    from osel_sim.ingestion.mapping import Mapping
+    from osel_sim.ingestion.columns import Columns
     from osel_sim.selection.reward import RewardWeights
 
 logger = logging.getLogger(__name__)
@@ -164,9 +164,9 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.ingestion.write import IngestedInstance, check_out, load_image, write_log
 
     start = time.perf_counter()
-    mapping = _mapping(config, out)
-    records = read_tables(mapping)
-    converted = convert(mapping, records)
+    columns = _columns(config, out)
+    records = read_tables(columns)
+    converted = convert(columns, records)
     instances = []
     for source in converted.sources:
         for image in source.images:
@@ -184,15 +184,15 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     if converted.dropped:
         differing = converted.differing or "none"
         logger.info("%d duplicate rows left out, %s of which differed from the row that was kept", converted.dropped, differing)
-    name = config.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if mapping.images else TFIDF)
+    name = config.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if columns.images else TFIDF)
     files = sorted({record.file for record in records})
     metadata = {
-        "task": mapping.name,
+        "task": columns.name,
         "policies": converted.policies,
         "source": {"metric": "table", "files": {file.name: file_digest(file) for file in files}},
     }
     texts = [item.text for item in instances]
-    identity = write_log(out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(mapping.images), config.device), metadata)
+    identity = write_log(out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(columns.images), config.device), metadata)
     return _result(config, out, converted.rows, identity, start)
 
 
@@ -228,20 +228,21 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     return _result(config, out, rows, identity, start)
 
 
-def _mapping(config: IngestConfig, out: Path) -> "Mapping":
-    from osel_sim.ingestion.flags import as_table
-    from osel_sim.ingestion.mapping_file import load_mapping, parse_mapping
+def _columns(config: IngestConfig, out: Path) -> "Columns":
+    from osel_sim.ingestion.columns import COMMAND_LINE
+    from osel_sim.ingestion.columns_file import load_columns, parse_columns
+    from osel_sim.ingestion.flags import as_data
 
     files = config.files or ()
     if config.map is not None:
         _refuse(config, (*TABLE_FLAGS, "policies", "at_least"), "--map: write it into the file")
-        return load_mapping(config.map, files)
+        return load_columns(config.map, files)
     if not files:
         raise UsageError("--map or --files is missing: give a mapping file, or tables and what their columns mean")
     for name in ("text", "success"):
         if getattr(config, name) is None:
             raise SettingError(name, "is missing; python -m osel_sim.ingest --help shows examples")
-    return parse_mapping(as_table(config, files), Path())
+    return parse_columns(as_data(config, files), COMMAND_LINE, Path())
 
 
 def _result(config: IngestConfig, out: Path, rows: "list[Row]", encoder: str, start: float) -> IngestResult:

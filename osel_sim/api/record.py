@@ -29,7 +29,7 @@ class RecordConfig(InstanceSettings, ContentSettings):
     task: Annotated[Names, MAIN] = ()
     """which tasks: names, tag:TAG, or all; of other suites SUITE:NAME"""
     policies: Annotated[Names | None, MAIN] = None
-    """policies to run (default: all there are)"""
+    """policies to run (default: all that fit the tasks)"""
     instances: Annotated[Count, MAIN] = 200
     """number of instances of each task"""
     repeats: Annotated[Count | None, MAIN] = None
@@ -111,16 +111,13 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
 
 def _plan(config: RecordConfig) -> "Plan":
     from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
-    from osel_sim.episodes.drivers import choose_policies, left_out, with_fallbacks
+    from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
     from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
     tasks = select_tasks(config.task, config.tasks, config.robot)
-    environment = common_specification(tasks)
-    policies = choose_policies(config.policies, environment, config.policies_dir)
-    if config.policies is None and (others := left_out(environment, config.policies_dir)):
-        logger.info("not made for the environment of %s, and left out: %s (--policies NAME says why)", environment.name, ", ".join(others))
+    policies = choose_policies(config.policies, common_specification(tasks), config.policies_dir)
     return Plan(
         tasks=tuple(tasks),
         policies=tuple(policies),

@@ -29,13 +29,13 @@ from osel_sim.core.trust import trusting
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.episodes.live import LiveRun
+    from osel_sim.episodes.run_subscribers import RunSubscriber
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.interface.encoder import Encoder
     from osel_sim.interface.policy import Policy
     from osel_sim.interface.selector import Selector
     from osel_sim.interface.suite import Task
     from osel_sim.policy.objects import PolicyObject
-    from osel_sim.reporting.live_page import LivePage
     from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | Callable[[Sequence[str], int, int], Selector]
@@ -50,7 +50,7 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     task: Annotated[Names, MAIN] = ()
     """which tasks, mixed at random: names, tag:TAG, or all; of other suites SUITE:NAME"""
     policies: Annotated[Names | None, MAIN] = None
-    """policies to choose from (default: all there are)"""
+    """policies to choose from (default: all that fit the tasks)"""
     selector: Annotated[str, MAIN] = "ppo"
     """ppo, auto, epsilon_greedy, random, fixed:POLICY ..."""
     episodes: Annotated[Count, MAIN] = 60
@@ -77,9 +77,9 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     @property
     def folder(self) -> Path:
         """Where to write."""
-        names = "-".join((*self.task, self.selector)).replace(":", "-").replace("/", "-")
+        tasks = "-".join(name.replace(":", "-").replace("/", "-") for name in self.task)
         robot = f"-{self.robot}" if self.robot else ""
-        return self.out or Path("runs") / f"{names}-s{self.seed}{robot}"
+        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}-s{self.seed}{robot}"
 
     @property
     def filmed(self) -> frozenset[int]:
@@ -96,6 +96,7 @@ def run(
     *,
     policies: "Sequence[str | Policy | PolicyObject] | None" = None,
     selector: "SelectorLike | None" = None,
+    subscribers: "Sequence[RunSubscriber]" = (),
     **values: Any,
 ) -> RunResult:
     """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward.
@@ -104,6 +105,7 @@ def run(
         config: settings as one object; `values` change some of them.
         policies: names of policy files, or objects with `reset` and `act` (`osel_sim.as_policy` says what they are shown and cost).
         selector: name of a selector, or a class or function of one's own: called with the policies' names, the context's length and the seed.
+        subscribers: what else watches the run (`osel_sim.episodes.run_subscribers`), beside progress, timings, TensorBoard and the page.
         values: settings by name, as `RunConfig` has them.
 
     Raises:
@@ -120,7 +122,7 @@ def run(
         factory = None if isinstance(selector, str) else selector
     config = RunConfig.of(**values) if config is None else config.changed(**values)
     with trusting(config.trust):
-        return _Run(config, objects, factory).execute()
+        return _Run(config, objects, factory, subscribers).execute()
 
 
 def _name(factory: Any) -> str:
@@ -133,15 +135,23 @@ class _Run:
     Args:
         objects: policies that no file describes.
         factory: makes the selector where it is none of the registry's.
+        watchers: subscribers of the caller's own.
     """
 
-    def __init__(self, config: RunConfig, objects: "Mapping[str, PolicyObject]", factory: "Callable[..., Selector] | None") -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        objects: "Mapping[str, PolicyObject]",
+        factory: "Callable[..., Selector] | None",
+        watchers: "Sequence[RunSubscriber]",
+    ) -> None:
         from osel_sim.api.reward import weights_of
-        from osel_sim.episodes.drivers import choose_policies, left_out, with_fallbacks
+        from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
+        from osel_sim.reporting.live_page import LivePage
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
-        self.config, self.objects, self.factory = config, objects, factory
+        self.config, self.objects, self.factory, self.watchers = config, objects, factory, watchers
         if config.tensorboard:
             from osel_sim.episodes.tensorboard import check_installed
 
@@ -149,15 +159,14 @@ class _Run:
         self.tasks = select_tasks(config.task, config.tasks, config.robot)
         self.environment = common_specification(self.tasks)
         self.policies = choose_policies(config.policies, self.environment, config.policies_dir, objects)
-        if config.policies is None and (others := left_out(self.environment, config.policies_dir)):
-            logger.info("not made for the environment of %s, and left out: %s (--policies NAME says why)", self.environment.name, ", ".join(others))
         self.everyone = with_fallbacks(self.policies, config.policies_dir)
         self.weights = weights_of(config)[0]
         self._check_selector()
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
-        # Drawing an instance refuses a level or an axis that there is not.
+        # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
         self.axes_above = sorted({instance.axes for instance in drawn if instance.axes})
+        self.page = LivePage()
 
     def execute(self) -> RunResult:
         """Do it."""
@@ -172,11 +181,10 @@ class _Run:
         encoder = load_encoder(config.encoder or DEFAULT_ENCODER)
         configuration["encoder"] = encoder.identity
         seen = self._log(config.warm_start, encoder.identity) if config.warm_start else None
-        machine = ran_with(self.tasks)  # probes for a display before anything heavy is loaded
+        machine = ran_with(self.tasks)
 
         from osel_sim.core.torch_settings import threads
         from osel_sim.episodes.drivers import Drivers
-        from osel_sim.reporting.live_page import LivePage
 
         # The last bits of a matrix product depend on the number of threads; one, so that a run does not depend on how many there are.
         with contextlib.ExitStack() as stack:
@@ -187,15 +195,15 @@ class _Run:
             # Only now, when all that could be missing is there, is the folder taken into use.
             for warning in start_or_resume(folder, configuration, machine, config.resume, config.to_json()):
                 logger.warning(warning)
-            page = LivePage()
-            live = stack.enter_context(contextlib.closing(self._live(encoder, drivers, selector, page)))
+            live = self._live(folder, encoder, drivers, selector)
+            stack.callback(live.close)
             if seen is not None:
                 self._start_warm(live, seen)
             live.replay()
-            interrupt = _Interrupt()
-            with interrupt:
+            with _Interrupt() as interrupt:
                 live.run(config.episodes, lambda: interrupt.asked)
-        return self._finish(live, page, interrupt.asked and len(live.decisions) < config.episodes)
+            interrupted = interrupt.asked and len(live.decisions) < config.episodes
+        return self._finish(live, interrupted)
 
     def _check_selector(self) -> None:
         """Refuse an unknown selector before anything heavy is loaded."""
@@ -255,18 +263,23 @@ class _Run:
 
         return read_log(folder, encoder).only([spec.name for spec in self.policies])
 
-    def _live(self, encoder: "Encoder", drivers: Any, selector: "Selector", page: "LivePage") -> "LiveRun":
+    def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
         from osel_sim.episodes.live import LiveOptions, LiveRun
+
+        config = self.config
+        options = LiveOptions(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise)
+        return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder))
+
+    def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
+        """What watches the run."""
         from osel_sim.episodes.progress import Progress
         from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
         from osel_sim.episodes.tensorboard import TensorBoard
 
         config = self.config
-        wanted = [(config.realtime, Paced), (config.tensorboard, TensorBoard)]
-        films = [Films(config.folder, config.filmed)] if config.video else []
-        watching = [TimingFile(), *films, *(make() for asked, make in wanted if asked), Progress(config.episodes), page]
-        options = LiveOptions(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise)
-        return LiveRun(config.folder, self.tasks, encoder, drivers, selector, options, watching)
+        films = [Films(folder, config.filmed)] if config.video else []
+        wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard)) if asked]
+        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), self.page]
 
     def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
@@ -277,15 +290,14 @@ class _Run:
         count = show(live.selector, WarmStart(log.contexts, log.rewards(self.weights)), live.selector.policies, self.config.seed)
         logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
 
-    def _finish(self, live: "LiveRun", page: "LivePage", interrupted: bool) -> RunResult:
+    def _finish(self, live: "LiveRun", interrupted: bool) -> RunResult:
         """Write summary, curve and the selector's state."""
         from osel_sim.api.run_files import write_results
 
         summary = write_results(live, title(self.tasks), self.config.selector)
-        if page.problem is not None:
-            logger.warning("no report.html: %s", page.problem)
-        file = live.folder / "report.html"
-        return RunResult(live.folder, summary, tuple(live.decisions), file if page.problem is None and live.decisions else None, interrupted)
+        if self.page.problem is not None:
+            logger.warning("no report.html: %s", self.page.problem)
+        return RunResult(live.folder, summary, tuple(live.decisions), self.page.file, interrupted)
 
 
 class _Interrupt:

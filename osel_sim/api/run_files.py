@@ -10,11 +10,7 @@ logger = logging.getLogger(__name__)
 
 
 def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
-    """Write them.
-
-    Returns:
-        the summary; empty where no decision was made.
-    """
+    """Write them. Returns the summary, empty where no decision was made."""
     from osel_sim.core.files import write_json
     from osel_sim.figures import learning_curve
     from osel_sim.formats.summary import summarise

@@ -26,7 +26,7 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
     return {
         "tasks": [_task(load_task_file(file)) for _, file in sorted(content.files("tasks", tasks).items())],
         "policies": [_policy(load_policy_file(file)) for _, file in sorted(content.files("policies", policies).items())],
-        "suites": [_suite(name) for name in sorted(SUITES)],
+        "suites": [_suite(name) for name in SUITES.others()],
     }
 
 

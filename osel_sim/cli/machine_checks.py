@@ -15,11 +15,11 @@ from osel_sim.core.files import read_json
 from osel_sim.core.shown import shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
-from osel_sim.interface.suite import OURS
 from osel_sim.policy.environment_fit import misfits
 from osel_sim.sim.robots import with_robot
 from osel_sim.sim.specification import specification
-from osel_sim.suites.registry import load_suite, suite_names
+from osel_sim.suites import SUITES
+from osel_sim.suites.registry import load_suite
 
 DISTRIBUTION = "osel-sim"
 CONFIG = "config.json"
@@ -32,7 +32,7 @@ class Check:
     """One thing looked at.
 
     Attributes:
-        area: python, packages, display, machine, tasks, policies, encoder.
+        area: python, packages, display, machine, tasks, suites, policies, encoder.
         name: what was looked at.
         found: what was found, in words.
         state: `ok`, `note` (good to know, nothing is blocked) or `missing` (a run needs it).
@@ -157,13 +157,12 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
 
 def _suites() -> Iterator[Check]:
     """Suites of others that are installed; nothing of ours needs one."""
-    for name in suite_names():
-        if name != OURS:
-            try:
-                suite = load_suite(name)
-                yield Check("suites", name, f"{suite.spec.title}, {len(suite.tasks)} tasks")
-            except OselError as error:
-                yield Check("suites", name, str(error), NOTE)
+    for name in SUITES.others():
+        try:
+            suite = load_suite(name)
+            yield Check("suites", name, f"{suite.spec.title}, {len(suite.tasks)} tasks")
+        except OselError as error:
+            yield Check("suites", name, str(error), NOTE)
 
 
 def _policies(folder: Path | None) -> Iterator[Check]:

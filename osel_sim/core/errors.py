@@ -1,4 +1,4 @@
-"""Typed errors. Every one of them is the user's to read: commands print its message as one line and exit with `exit_code`."""
+"""Typed errors. Every one of them is the user's to read: commands print its message and exit with `exit_code`."""
 
 import difflib
 from collections.abc import Callable, Iterable
@@ -41,10 +41,15 @@ class MissingPackageError(UsageError):
 
 
 class ContentError(OselError):
-    """A task or policy file is wrong. The message names the file, the key and what would be right."""
+    """A task, policy or other TOML file is wrong. The message has a line for each fault: the file, the key and what would be right.
 
-    def __init__(self, file: object, key: str, problem: str) -> None:
-        super().__init__(f"{file}: {key}: {problem}")
+    Attributes:
+        faults: (key, problem) of each.
+    """
+
+    def __init__(self, file: object, key: str, problem: str, *more: tuple[str, str]) -> None:
+        self.faults = ((key, problem), *more)
+        super().__init__("\n".join(f"{file}: {key}: {problem}" for key, problem in self.faults))
 
 
 class CheckpointError(OselError):

@@ -1,5 +1,6 @@
 """Policies made ready to drive: local ones loaded, servers of remote ones started, fallbacks found."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,17 +15,17 @@ from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.policy.environment_fit import check_environment, misfits
 from osel_sim.policy.objects import PolicyObject
 
+logger = logging.getLogger(__name__)
+
 
 def choose_policies(
     names: Sequence[str] | None, environment: EnvironmentSpec, folder: Path | None = None, objects: Mapping[str, PolicyObject] | None = None
 ) -> list[PolicySpec]:
-    """Policy files by name, or all that fit the environment and see no more than a robot could (`left_out` tells the others).
+    """Policy files by name, or all that fit the environment and see no more than a robot could; the log says which are left out.
 
     Args:
         environment: what they are to drive.
         folder: the user's own policy files.
-
-    Args:
         objects: policies that no file describes, by name.
 
     Raises:
@@ -36,6 +37,8 @@ def choose_policies(
         unfit = left_out(environment, folder)
         specs = [library.load_policy(name, folder) for name in content.files("policies", folder) if name not in unfit]
         names = [spec.name for spec in specs if not spec.is_privileged]
+        if unfit:
+            logger.info("not made for the environment of %s, and left out: %s (naming one says why)", environment.name, ", ".join(unfit))
         if not names and unfit:
             raise UsageError(f"no policy there is drives in the environment of {environment.name}, such as {next(iter(unfit.values()))}")
     wanted = list(names)
@@ -45,7 +48,7 @@ def choose_policies(
         if wanted.count(name) > 1:
             raise UsageError(f"policy {name!r} is named twice after --policies")
     at_hand = objects or {}
-    found = [at_hand[name].spec if name in at_hand else library.load_policy(name, folder) for name in wanted]
+    found = [at_hand[name].spec_for(environment) if name in at_hand else library.load_policy(name, folder) for name in wanted]
     for spec in found:
         check_environment(spec, environment)
     return found

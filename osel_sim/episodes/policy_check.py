@@ -129,7 +129,7 @@ def check_policy(spec: PolicySpec, task: Task, seed: int, level: int, out: Path,
     """
     from osel_sim.episodes.drivers import Drivers
 
-    instance, environment = task.instance(seed, level, "test"), task.specification
+    instance, environment = task.instance(seed, level), task.specification
     report = Report(spec.name, instance.key, instance.instruction)
     with Drivers([spec], environment) as drivers:
         watched = Watched(drivers[spec.name].caller)

@@ -18,7 +18,7 @@ class Progress(RunSubscriber):
 
     def __init__(self, decisions: int) -> None:
         self._total = decisions
-        self._open = contextlib.ExitStack()
+        self._shown = contextlib.ExitStack()
         self._bar: Bar | None = None
         self._policies: list[str] = []
         self._seen: list[Decision] = []
@@ -26,7 +26,7 @@ class Progress(RunSubscriber):
     @override
     def on_start(self, run: Run) -> None:
         self._policies, self._seen = list(run.policies), list(run.decisions)
-        self._bar = self._open.enter_context(progress(self._total, "episode", initial=len(self._seen)))
+        self._bar = self._shown.enter_context(progress(self._total, "episode", initial=len(self._seen)))
 
     @override
     def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:
@@ -41,7 +41,7 @@ class Progress(RunSubscriber):
 
     @override
     def close(self) -> None:
-        self._open.close()
+        self._shown.close()
 
     def _words(self) -> str:
         rewards = [decision.reward for decision in self._seen if decision.reward is not None]

@@ -11,14 +11,14 @@ import platform
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
 from osel_sim.core.files import digest, is_partial, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.robot import DEFAULT_ROBOT
-from osel_sim.interface.suite import OURS, Task
+from osel_sim.interface.suite import Task
 
 SCHEMA_VERSION = 1
 RUN = "run.json"
@@ -69,11 +69,25 @@ def content_digests(tasks: Iterable[Task], policies: Iterable[PolicySpec]) -> di
     return digests
 
 
-def robots_said(tasks: Iterable[Task]) -> dict[str, Any]:
+class HasRobot(Protocol):
+    """A task, and who does it."""
+
+    @property
+    def name(self) -> str:
+        """Name of the task."""
+        ...
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot; empty where the suite has but one."""
+        ...
+
+
+def robots_said(tasks: Iterable[HasRobot]) -> dict[str, Any]:
     """`robot` of a configuration: the one that does all tasks, or the robot of each; nothing where that is the usual one."""
-    robots = {task.name: task.specification.robot for task in tasks if task.suite.spec.name == OURS}
-    names = set(robots.values()) or {DEFAULT_ROBOT}
-    return {"robot": robots if len(names) > 1 else names.pop()} if names != {DEFAULT_ROBOT} else {}
+    robots = {task.name: task.robot for task in tasks}
+    names = set(robots.values())
+    return {"robot": robots if len(names) > 1 else names.pop()} if names - {DEFAULT_ROBOT, ""} else {}
 
 
 def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:

@@ -63,7 +63,7 @@ class Instance(Protocol):
 
     @property
     def other_robot(self) -> str | None:
-        """Name of the robot where it is one of ours and not the usual one, else None: as journals and logs have it."""
+        """Name of the robot, where it is another than the suite's usual one; None: the usual one."""
         ...
 
 
@@ -85,16 +85,12 @@ class SeededInstance:
     phrasing: str = ""
     target: str = ""
     container: str = ""
+    other_robot: str | None = None
 
     @property
     def key(self) -> str:
         """Name of the instance, unique over all suites."""
         return f"{self.task}/{self.split}/{label(self.level, self.axes)}/{self.seed}"
-
-    @property
-    def other_robot(self) -> str | None:
-        """None: the suite's own robot."""
-        return None
 
     @property
     def simulator_seed(self) -> int:

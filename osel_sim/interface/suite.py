@@ -49,6 +49,7 @@ class TaskInfo:
         digest: changes when the task does (a version, or a digest of its file): a run whose tasks changed is not resumed.
         tags: by which it is chosen, `SUITE:tag:TAG`.
         axes: of perturbation that it allows.
+        robot: name of the robot that does it, where the suite has several.
     """
 
     title: str
@@ -56,6 +57,7 @@ class TaskInfo:
     digest: str
     tags: tuple[str, ...] = ()
     axes: tuple[str, ...] = ()
+    robot: str = ""
 
 
 class Suite(Protocol):
@@ -110,6 +112,11 @@ class Task:
         """Its name over all suites: `SUITE:TASK`, without the suite where that is ours."""
         suite = self.suite.spec.name
         return self.short_name if suite == OURS else f"{suite}{SUITE_SEPARATOR}{self.short_name}"
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot that does it; empty where the suite has but one."""
+        return self.info.robot
 
     @functools.cached_property
     def info(self) -> TaskInfo:

@@ -9,7 +9,7 @@ from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from osel_sim.core.errors import CheckpointError, nearest
-from osel_sim.formats.mapping import ENVIRONMENT_STATES, Mapping
+from osel_sim.formats.conventions import ENVIRONMENT_STATES, Conventions
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.policy.mapping import known_parts, state_size, wanted_parts
@@ -75,7 +75,7 @@ def check_processors(spec: PolicySpec, checkpoint: str) -> None:
         )
 
 
-def camera_keys(mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, str]:
+def camera_keys(mapping: Conventions, cameras: tuple[str, ...]) -> dict[str, str]:
     """Checkpoint's image key -> camera here."""
     return {mapping.key(camera): camera for camera in cameras}
 

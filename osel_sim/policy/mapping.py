@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import PolicyError
-from osel_sim.formats.mapping import STATE_PARTS, Mapping
+from osel_sim.formats.conventions import STATE_PARTS, Conventions
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.policy import Observation
 
@@ -26,18 +26,18 @@ def known_parts(environment: EnvironmentSpec) -> dict[str, int]:
     return {**environment.state, **derived}
 
 
-def wanted_parts(mapping: Mapping, environment: EnvironmentSpec) -> tuple[str, ...]:
+def wanted_parts(mapping: Conventions, environment: EnvironmentSpec) -> tuple[str, ...]:
     """Parts of the state that a policy wants, in order: those that its file names, else the environment's own."""
     return mapping.state_parts or tuple(environment.state)
 
 
-def state_size(mapping: Mapping, environment: EnvironmentSpec) -> int:
+def state_size(mapping: Conventions, environment: EnvironmentSpec) -> int:
     """How many numbers the state of a policy has."""
     known = known_parts(environment)
     return sum(known[part] for part in wanted_parts(mapping, environment))
 
 
-def state_of(observation: Observation, mapping: Mapping, environment: EnvironmentSpec) -> NDArray[np.float32]:
+def state_of(observation: Observation, mapping: Conventions, environment: EnvironmentSpec) -> NDArray[np.float32]:
     """The state as the policy wants it, (state_size,)."""
     state, parts, start = np.asarray(observation[STATE], np.float64), dict[str, NDArray[np.float64]](), 0
     for part, size in environment.state.items():
@@ -56,7 +56,7 @@ def _part(parts: dict[str, NDArray[np.float64]], part: str) -> NDArray[np.float6
     return orientation(source, part)
 
 
-def message_of(observation: Observation, mapping: Mapping, cameras: tuple[str, ...], environment: EnvironmentSpec) -> dict[str, Any]:
+def message_of(observation: Observation, mapping: Conventions, cameras: tuple[str, ...], environment: EnvironmentSpec) -> dict[str, Any]:
     """An observation under the policy's own names."""
     message: dict[str, Any] = {mapping.key(camera): observation[f"observation.images.{camera}"] for camera in cameras}
     if cameras:
@@ -68,7 +68,7 @@ def message_of(observation: Observation, mapping: Mapping, cameras: tuple[str, .
     return message
 
 
-def actions_of(value: Any, mapping: Mapping, action: ActionSpec) -> NDArray[Any]:
+def actions_of(value: Any, mapping: Conventions, action: ActionSpec) -> NDArray[Any]:
     """A policy's chunk (T, N), or single action (N,), as actions of the environment (T, D).
 
     Raises:
@@ -99,7 +99,7 @@ def actions_of(value: Any, mapping: Mapping, action: ActionSpec) -> NDArray[Any]
     return result
 
 
-def has_scale(mapping: Mapping) -> bool:
+def has_scale(mapping: Conventions) -> bool:
     """Whether a policy's motions are scaled at all."""
     return any(scale != 1.0 for scale in mapping.scale)
 

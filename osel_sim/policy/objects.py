@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from osel_sim.core.errors import UsageError
 from osel_sim.formats.policy_file import PolicySpec, Price
+from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Policy
 
 OBJECT = "object"
@@ -25,12 +26,16 @@ class PolicyObject:
     spec: PolicySpec
     policy: Policy
 
+    def spec_for(self, environment: EnvironmentSpec) -> PolicySpec:
+        """What a policy file would say of it, with all cameras of an environment where it names none."""
+        return self.spec if self.spec.cameras else replace(self.spec, cameras=environment.cameras)
+
 
 def as_policy(
     policy: Policy,
     name: str | None = None,
     *,
-    cameras: Sequence[str] = ("agentview", "wrist"),
+    cameras: Sequence[str] | None = None,
     image_size: int = 96,
     execute: int = 1000,
     inference_seconds: float = 0.0,
@@ -39,9 +44,9 @@ def as_policy(
     """Say what a policy file would say of a policy object.
 
     Args:
-        policy: an object with `reset(instruction)` and `act(observation)`, which returns actions (T, 7) float32 in [-1, 1].
+        policy: an object with `reset(instruction)` and `act(observation)`, which returns actions (T, D) float32.
         name: what it is called; None: its class's name in small letters.
-        cameras, image_size: what it is shown (square, pixels).
+        cameras, image_size: what it is shown (square, pixels); None: all cameras that there are.
         execute: actions of each chunk that are executed before it is asked again; at most the chunk's length.
         inference_seconds: declared time of one inference on the virtual clock.
         price_per_action: cents for each executed action.
@@ -61,7 +66,7 @@ def as_policy(
         title=f"{kind.__name__} (a Python object)",
         kind=OBJECT,
         checkpoint="",
-        cameras=tuple(cameras),
+        cameras=tuple(cameras or ()),
         image_size=image_size,
         execute=execute,
         inference_seconds=inference_seconds,

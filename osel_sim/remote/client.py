@@ -14,7 +14,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.core.errors import PolicyError, RemoteError
 from osel_sim.core.shown import shown
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Actions, Observation
 from osel_sim.policy.local import check_actions
@@ -66,14 +66,14 @@ class RemoteClient:
         token: str | None = None,
         timeout: float = 30.0,
         expect: Greeting | None = None,
-        mapping: Mapping | None = None,
+        mapping: Conventions | None = None,
     ) -> None:
+        self._environment = environment
         self.url = shown(url)
         """The address without what is secret in it; errors begin with it."""
         self._address, self._timeout, self._expect = url, timeout, expect
         self._token = None if token is None else check_header(token)
-        self._environment = environment
-        self._mapping = mapping or Mapping()
+        self._mapping = mapping or Conventions()
         self._connection: ClientConnection | None = None
         self._hang_up = contextlib.ExitStack()
         self._greeting: Greeting | None = None

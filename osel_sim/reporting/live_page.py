@@ -1,5 +1,6 @@
 """Writes the page of a live run when that is over."""
 
+from pathlib import Path
 from typing import override
 
 from osel_sim.core.errors import OselError
@@ -12,10 +13,12 @@ class LivePage(RunSubscriber):
     """Writes `report.html` with its figures and tables into the run's folder, unless no decision was made.
 
     Attributes:
+        file: the page, or None where there is none.
         problem: why it could not be written, or None. The run itself is complete then; `python -m osel_sim.report` tries again.
     """
 
     def __init__(self) -> None:
+        self.file: Path | None = None
         self.problem: OselError | None = None
 
     @override
@@ -23,6 +26,6 @@ class LivePage(RunSubscriber):
         if not run.decisions:
             return
         try:
-            write_page(run_page(run.folder), run.folder)
+            self.file = write_page(run_page(run.folder), run.folder)
         except OselError as problem:
             self.problem = problem

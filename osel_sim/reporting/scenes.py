@@ -25,16 +25,14 @@ def render_scenes(log: LoggedOutcomes, count: int, tasks: Path | None = None) ->
         DisplayError: no OpenGL backend works.
     """
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.interface.suite import OURS
     from osel_sim.suites.registry import find_task
 
     rows = np.unique(np.linspace(0, len(log) - 1, min(count, len(log))).round().astype(int)).tolist()
     wanted = sorted({(log.instances[row].task, log.instances[row].robot or "") for row in rows})
     pictures: dict[int, bytes] = {}
     for name, robot in wanted:
-        task = find_task(name, tasks)
-        if task.suite.spec.name == OURS:
-            task = find_task(name, tasks, robot or DEFAULT_ROBOT)
+        own = find_task(name, tasks)
+        task = find_task(name, tasks, robot or DEFAULT_ROBOT) if own.robot else own  # a file may name another robot since
         env = task.open()
         try:
             for row in rows:
@@ -43,11 +41,11 @@ def render_scenes(log: LoggedOutcomes, count: int, tasks: Path | None = None) ->
                     continue
                 if logged.seed is None or logged.level is None or logged.split is None:
                     raise DataError(f"{log.source}: instance {logged.key!r} has no seed, level and split, so it cannot be rendered again")
-                label = logged.key.removeprefix(task.name).split("/")[2]  # the key has what the columns lack
+                label = logged.key.removeprefix(name).split("/")[2]  # the key has what the columns lack
                 perturbed = parse_axes((part for part in label.split(",") if "=" in part), task.suite.spec.axes)
                 instance = task.instance(logged.seed, logged.level, logged.split, perturbed)
                 if (instance.key, instance.instruction) != (logged.key, logged.instruction):
-                    raise DataError(f"task {task.name!r} no longer makes the instance {logged.key!r} of {log.source}")
+                    raise DataError(f"task {name!r} no longer makes the instance {logged.key!r} of {log.source}")
                 env.load(instance)
                 pictures[row] = jpeg(env.image(env.specification.context_camera, SIZE, SIZE, "full"), SIZE)
         finally:

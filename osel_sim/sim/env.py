@@ -114,7 +114,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
     @property
     def specification(self) -> EnvironmentSpec:
         """What it offers a policy."""
-        return specification(horizon=self.task.horizon)
+        return specification(self.task.robot, self.task.horizon)
 
     def load(self, instance: Instance) -> None:
         """Reset to an instance."""

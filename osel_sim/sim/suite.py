@@ -11,7 +11,7 @@ from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.instance import SPLITS
 from osel_sim.interface.suite import OURS, SuiteSpec, TaskInfo
-from osel_sim.sim.robots import with_robot
+from osel_sim.sim.robots import load_robot, with_robot
 from osel_sim.sim.specification import specification
 
 if TYPE_CHECKING:
@@ -36,15 +36,15 @@ class TaskFiles(Mapping[str, TaskInfo]):
 
         Raises:
             UnknownNameError: there is none.
-            ContentError: it is wrong.
+            ContentError: it is wrong, or names a robot that there is not.
         """
         if name not in self._specs:
-            (self._specs[name],) = with_robot([load_task_file(content.find("tasks", name, self._folder))], self._robot)
+            self._specs[name] = with_robot([load_task_file(content.find("tasks", name, self._folder))], self._robot)[0]
         return self._specs[name]
 
     def __getitem__(self, name: str) -> TaskInfo:
         spec = self.spec(name)
-        return TaskInfo(spec.title, spec.horizon, digest(spec.file), spec.tags, spec.axes)
+        return TaskInfo(spec.title, spec.horizon, digest(spec.file), spec.tags, spec.axes, spec.robot)
 
     def __iter__(self) -> Iterator[str]:
         return iter(sorted(content.files("tasks", self._folder)))
@@ -59,11 +59,16 @@ class OurSuite:
     Args:
         folder: task files of the user's own.
         robot: that does all tasks; None: each as its file says.
+
+    Raises:
+        UnknownNameError: there is no such robot.
     """
 
     spec = SuiteSpec(OURS, "Task files in robosuite scenes", LEVELS, SPLITS, AXES, opengl=True)
 
     def __init__(self, folder: Path | None = None, robot: str | None = None) -> None:
+        if robot is not None:
+            load_robot(robot)
         self.tasks = TaskFiles(folder, robot)
 
     def specification(self, task: str) -> EnvironmentSpec:

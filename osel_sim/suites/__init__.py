@@ -4,8 +4,5 @@ from typing import Any
 
 from osel_sim.core.registry import Registry
 
-RESERVED = ("osel_sim", "all", "tag", "skill")
-"""Not for suites of others: ours, `all` and `tag:` select tasks, and `skill:` begins the keys of examples among the contexts of instances."""
-
-SUITES = Registry[Any]("suite", "osel_sim.suites", {}, reserved=RESERVED)
-"""Suites of others."""
+SUITES = Registry[Any]("suite", "osel_sim.suites", {"osel_sim": "osel_sim.sim.suite:OurSuite"})
+"""What makes each suite, ours and those of others; `osel_sim.suites.registry` calls it."""

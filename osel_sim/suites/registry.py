@@ -4,7 +4,6 @@ Suites of others come by the entry-point group `osel_sim.suites` and are importe
 suite's; its value, `module:attribute`, is called without arguments and returns the suite (`osel_sim.interface.suite`).
 """
 
-import importlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -14,14 +13,10 @@ from osel_sim.interface.instance import SUITE_SEPARATOR
 from osel_sim.interface.suite import OURS, Suite, Task
 from osel_sim.suites import SUITES
 
-OURS_LOCATION = "osel_sim.sim.suite", "OurSuite"
 ALL, TAG = "all", "tag"
+RESERVED = (ALL, TAG, "skill")
+"""Not for suites of others: `skill:` begins the keys of examples among the contexts of instances."""
 LISTING = "python -m osel_sim.run --list"
-
-
-def suite_names() -> list[str]:
-    """Names of all suites: ours first."""
-    return [OURS, *sorted(SUITES)]
 
 
 def load_suite(name: str, folder: Path | None = None, robot: str | None = None) -> Suite:
@@ -29,34 +24,36 @@ def load_suite(name: str, folder: Path | None = None, robot: str | None = None) 
 
     Args:
         folder: task files of the user's own, for our suite.
-        robot: that does all tasks of our suite; None: each as its file says.
+        robot: that does all tasks of our suite; None: each task's own.
 
     Raises:
         UnknownNameError: there is none of that name.
         MissingPackageError: importing it needs a package that is not installed.
-        UsageError: a robot for another suite than ours, or its entry point does not lead to a suite of that name.
+        UsageError: its entry point does not lead to a suite of that name, or a suite of others is asked for a robot.
     """
+    if name in RESERVED:
+        raise UsageError(f"{name!r} is no name for a suite: it means something else in names of tasks")
+    make = SUITES.load(name, f"the suite stands before the colon, as in SUITE:TASK; {LISTING}")
     if name == OURS:
-        module, attribute = OURS_LOCATION
-        ours: Suite = getattr(importlib.import_module(module), attribute)(folder, robot)
+        ours: Suite = make(folder, robot)
         return ours
     if robot is not None:
-        raise UsageError(f"--robot {robot}: suite {name!r} has robots of its own; the flag is for our tasks")
-    if name not in SUITES:
-        raise UnknownNameError("suite", name, suite_names(), f"the suite stands before the colon, as in SUITE:TASK; {LISTING}")
-    make, location = SUITES.load(name), SUITES.locations()[name]
+        raise UsageError(f"suite {name!r} has its own robot: leave --robot out")
     try:
         suite: Suite = make()
         found = suite.spec.name
-    except (AttributeError, ImportError, TypeError) as error:
-        raise UsageError(f"suite {name!r}: {location} does not make a suite ({type(error).__name__}: {error})") from error
+    except (AttributeError, TypeError) as error:
+        raise UsageError(f"suite {name!r}: {SUITES.locations()[name]} makes no suite ({type(error).__name__}: {error})") from error
     if found != name:
-        raise UsageError(f"suite {name!r}: {location} makes one that calls itself {found!r}")
+        raise UsageError(f"suite {name!r}: {SUITES.locations()[name]} makes one that calls itself {found!r}")
     return suite
 
 
 def find_task(name: str, folder: Path | None = None, robot: str | None = None) -> Task:
     """A task by name: `TASK` of ours, `SUITE:TASK` of another suite.
+
+    Args:
+        folder, robot: as `load_suite` takes them.
 
     Raises:
         UnknownNameError: with the nearest known name.
@@ -74,6 +71,9 @@ def select_tasks(wanted: Sequence[str], folder: Path | None = None, robot: str |
     """Tasks by name, each once, in the order asked for.
 
     Names are `TASK`, `tag:TAG` or `all` of ours, and `SUITE:TASK`, `SUITE:tag:TAG` or `SUITE:all` of another suite.
+
+    Args:
+        folder, robot: as `load_suite` takes them.
 
     Raises:
         UsageError: nothing is asked for.
