@@ -5,7 +5,7 @@ Listing names imports nothing; a name is imported when it is loaded.
 
 import functools
 import sys
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
@@ -21,12 +21,11 @@ class Registry[T]:
         group: entry-point group in which other packages offer more. They cannot replace a built-in one.
         built_in: name -> `module:attribute`.
         kind: what a loaded one must be an instance of; None: anything.
-        reserved: names that mean something else, and are not for other packages to take.
     """
 
-    def __init__(self, what: str, group: str, built_in: Mapping[str, str], kind: type[T] | None = None, reserved: Collection[str] = ()) -> None:
+    def __init__(self, what: str, group: str, built_in: Mapping[str, str], kind: type[T] | None = None) -> None:
         self.what, self.group = what, group
-        self._built_in, self._kind, self._reserved = built_in, kind, reserved
+        self._built_in, self._kind = built_in, kind
 
     def locations(self) -> dict[str, str]:
         """Name -> `module:attribute` of all there are."""
@@ -83,7 +82,7 @@ class Registry[T]:
         return cast(T, found)
 
     def _plugins(self) -> dict[str, list[EntryPoint]]:
-        return {name: points for name, points in _plugins(self.group, tuple(sys.path)).items() if name not in self._reserved}
+        return _plugins(self.group, tuple(sys.path))
 
 
 @functools.lru_cache
