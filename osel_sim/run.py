@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import shutil
 import signal
 import sys
 from collections.abc import Sequence
@@ -194,7 +195,6 @@ def _report(live: "LiveRun", selector: str) -> None:
     """Write summary, curve, page and the selector's state, and print the table."""
     from osel_sim.cli.console import console, run_table
     from osel_sim.core.files import write_json
-    from osel_sim.figures import learning_curve
     from osel_sim.formats.summary import summarise
     from osel_sim.reporting.page import write_page
     from osel_sim.reporting.run_page import run_page
@@ -210,12 +210,12 @@ def _report(live: "LiveRun", selector: str) -> None:
         summary |= _comparison(live, chosen)
     write_json(live.folder / "summary.json", summary)
     save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
-    learning_curve(live.folder / "curve.png", f"{_title(live.tasks)}, {len(chosen)} decisions", selector, policies, chosen, live.rewards)
     console().print(run_table(summary))
     for decision in [decision for decision in live.decisions if decision.error][:3]:
         print(f"error in episode {decision.index}: {decision.error}", file=sys.stderr)
     try:
         write_page(run_page(live.folder), live.folder)
+        shutil.copyfile(live.folder / "figures" / "curves.png", live.folder / "curve.png")  # what one looks for first
     except OselError as problem:  # the run itself is complete; python -m osel_sim.report tries again
         print(f"warning: no report.html: {problem}", file=sys.stderr)
         print(f"written to {live.folder}")
