@@ -6,7 +6,6 @@ import re
 import shutil
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -15,8 +14,6 @@ ROOT = Path(__file__).resolve().parent.parent
 EXAMPLES = ROOT / "examples"
 SHORT = ("own_policy", "own_selector", "price_sweep")
 MOST_LINES = 10
-
-curves = pytest.mark.skipif(find_spec("osel_sim.reporting.learning_curve") is None, reason="curves of results are not there yet")
 
 
 @pytest.fixture
@@ -62,7 +59,6 @@ def test_a_policy_object_of_ones_own_drives(checkout: Path) -> None:
 
 
 @pytest.mark.slow
-@curves
 def test_a_selector_class_of_ones_own_is_replayed_and_its_curve_written(checkout: Path) -> None:
     run("own_selector", checkout)
     assert "RecentBest" in (checkout / "runs" / "own_selector" / "curve.svg").read_text()
@@ -76,7 +72,6 @@ def test_less_is_paid_the_more_it_counts(checkout: Path) -> None:
 
 
 @pytest.mark.slow
-@curves
 def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import nbformat
     from nbclient import NotebookClient
