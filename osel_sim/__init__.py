@@ -1,3 +1,93 @@
-"""osel_sim: simulation-in-the-loop evaluation of online foundation-model selection in robotics."""
+"""Simulation-in-the-loop evaluation of online foundation-model selection in robotics.
 
-__version__ = "0.1.0"
+```python
+import osel_sim as osel
+
+result = osel.run(task="pick_place", policies=["local_small", "remote_large"], selector="auto", episodes=20)
+result.decisions  # a pandas frame, a row a decision
+```
+
+Everything here is imported when it is first used.
+"""
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from osel_sim.api.collect import CollectConfig, collect
+    from osel_sim.api.ingest import IngestConfig, ingest
+    from osel_sim.api.parts import load_log, load_policy, make_env, make_selector
+    from osel_sim.api.record import RecordConfig, record
+    from osel_sim.api.replay import ReplayConfig, replay
+    from osel_sim.api.report import ReportConfig, report
+    from osel_sim.api.run import RunConfig, run
+    from osel_sim.core.errors import OselError
+    from osel_sim.policy.objects import as_policy
+    from osel_sim.selection.base import SelectorBase
+
+_PLACES = {
+    "CollectConfig": "api.collect",
+    "IngestConfig": "api.ingest",
+    "OselError": "core.errors",
+    "RecordConfig": "api.record",
+    "ReplayConfig": "api.replay",
+    "ReportConfig": "api.report",
+    "RunConfig": "api.run",
+    "SelectorBase": "selection.base",
+    "as_policy": "policy.objects",
+    "collect": "api.collect",
+    "ingest": "api.ingest",
+    "load_log": "api.parts",
+    "load_policy": "api.parts",
+    "make_env": "api.parts",
+    "make_selector": "api.parts",
+    "record": "api.record",
+    "replay": "api.replay",
+    "report": "api.report",
+    "run": "api.run",
+}
+
+__all__ = [
+    "CollectConfig",
+    "IngestConfig",
+    "OselError",
+    "RecordConfig",
+    "ReplayConfig",
+    "ReportConfig",
+    "RunConfig",
+    "SelectorBase",
+    "as_policy",
+    "collect",
+    "ingest",
+    "load_log",
+    "load_policy",
+    "make_env",
+    "make_selector",
+    "record",
+    "replay",
+    "report",
+    "run",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module 'osel_sim' has no attribute {name!r}")
+    return getattr(import_module(f"osel_sim.{_PLACES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_PLACES])
+
+
+class _Package(ModuleType):
+    """This package. Importing the command `osel_sim.run` would set the attribute `run` to that module; here it stays the function."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _PLACES and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,26 +1,15 @@
 """What works here, what is missing and which command fixes it: `python -m osel_sim.doctor`. With --policy: how a policy is connected."""
 
-import argparse
-import importlib.metadata
 import json
-import os
-import platform
-import shutil
 import sys
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
+from typing import Annotated
 
-from osel_sim import cli
-from osel_sim.core import content
-from osel_sim.core.errors import ContentError, DisplayError
-from osel_sim.formats.policy_file import PolicySpec, load_policy_file
-from osel_sim.formats.task_file import load_task_file
-
-DISTRIBUTION = "osel-sim"
-CONFIG = "config.json"
-MINIMUM_MEMORY = 4.0
-OK, NOTE, MISSING = "ok", "note", "missing"
+from osel_sim.api.settings import MAIN, ContentSettings, Index, settings
+from osel_sim.cli.command import Command
+from osel_sim.cli.machine_checks import MISSING, NOTE, OK, Check, examine
+from osel_sim.core.trust import trusting
 
 EXAMPLES = """examples:
   python -m osel_sim.doctor
@@ -31,237 +20,54 @@ EXAMPLES = """examples:
 Exit code: 0 if everything needed for a run is there, 1 if something is missing (with --policy: if something is wrong with how it is connected)."""
 
 
-@dataclass(frozen=True)
-class Check:
-    """One thing looked at.
+@settings
+class DoctorConfig(ContentSettings):
+    """Report what works on this machine, what is missing and which command fixes it."""
 
-    Attributes:
-        area: python, packages, display, machine, tasks, policies, encoder.
-        name: what was looked at.
-        found: what was found, in words.
-        state: `ok`, `note` (good to know, nothing is blocked) or `missing` (a run needs it).
-        fix: the command or step that puts it right, or empty.
-    """
+    policy: Annotated[str | None, MAIN] = None
+    """name or file of a policy: run one instance with it and report on it"""
+    task: Annotated[str, MAIN] = "pick_place"
+    """task of that instance"""
+    seed: Annotated[Index, MAIN] = 0
+    """seed of that instance"""
+    level: Annotated[Index, MAIN] = 0
+    """its level"""
+    robot: Annotated[str | None, MAIN] = None
+    """its robot, such as UR5e (default: the one the task file names, else Panda)"""
+    out: Annotated[Path | None, MAIN] = None
+    """where its pictures go (default: runs/doctor/POLICY)"""
+    json: Annotated[bool, MAIN] = False
+    """print JSON"""
 
-    area: str
-    name: str
-    found: str
-    state: str = OK
-    fix: str = ""
 
-
-@cli.main
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
-    parser = cli.Parser("doctor", "Report what works on this machine, what is missing and which command fixes it.", EXAMPLES)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--tasks", type=cli.folder, metavar="DIR", help="folder with task files of your own")
-    parser.add_argument("--policies-dir", type=cli.folder, metavar="DIR", help="folder with policy files of your own")
-    parser.add_argument("--policy", metavar="NAME|FILE", help="run one instance with this policy and report on it")
-    parser.add_argument("--task", default="pick_place", help="task of that instance (default: %(default)s)")
-    parser.add_argument("--seed", type=cli.non_negative_int, default=0, help="seed of that instance (default: %(default)s)")
-    parser.add_argument("--level", type=cli.non_negative_int, default=0, help="its level (default: %(default)s)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where its pictures go (default: runs/doctor/POLICY)")
-    options = parser.parse_args(arguments)
-    if options.policy is not None:
-        return _examine_policy(options)
-    checks = examine(options.tasks, options.policies_dir)
+def _execute(config: DoctorConfig) -> int:
+    if config.policy is not None:
+        with trusting(config.trust):
+            return _examine_policy(config, config.policy)
+    checks = examine(config.tasks, config.policies_dir)
     ready = all(check.state != MISSING for check in checks)
-    if options.json:
+    if config.json:
         print(json.dumps({"ready": ready, "checks": [asdict(check) for check in checks]}, indent=2))
     else:
         _print(checks, ready)
     return 0 if ready else 1
 
 
-def _examine_policy(options: argparse.Namespace) -> int:
+def _examine_policy(config: DoctorConfig, policy: str) -> int:
     from osel_sim.cli.policy_report import print_report
     from osel_sim.episodes.policy_check import check_policy, find_policy
+    from osel_sim.formats.library import select_tasks
+    from osel_sim.sim.robots import with_robot
 
-    spec, folder = find_policy(options.policy, options.policies_dir)
-    out = options.out or Path("runs") / "doctor" / spec.name
-    report = check_policy(spec, options.task, options.seed, options.level, out, options.tasks, folder)
-    if options.json:
+    spec, folder = find_policy(policy, config.policies_dir)
+    out = config.out or Path("runs") / "doctor" / spec.name
+    task = with_robot(select_tasks([config.task], config.tasks), config.robot)[0]
+    report = check_policy(spec, task, config.seed, config.level, out, folder)
+    if config.json:
         print(json.dumps(asdict(report), indent=2))
     else:
         print_report(report, out)
     return 0 if report.sound else 1
-
-
-def examine(tasks: Path | None = None, policies: Path | None = None) -> list[Check]:
-    """All checks, in the order in which they are shown.
-
-    Args:
-        tasks: a folder of the user's own task files.
-        policies: a folder of the user's own policy files.
-    """
-    return [*_python(), *_packages(), *_display(), *_machine(), *_tasks(tasks), *_policies(policies), *_encoder()]
-
-
-def _python() -> Iterator[Check]:
-    yield Check("python", platform.python_implementation(), f"{platform.python_version()} in {sys.prefix}")
-    try:
-        version = importlib.metadata.version(DISTRIBUTION)
-    except importlib.metadata.PackageNotFoundError:
-        yield Check("python", DISTRIBUTION, "runs from its folder, not installed", MISSING, _install(DISTRIBUTION))
-        return
-    yield Check("python", DISTRIBUTION, f"{version}, content in {content.root()}")
-
-
-def _packages() -> Iterator[Check]:
-    """Every declared dependency: there, and of a version that fits."""
-    from packaging.requirements import Requirement
-
-    try:
-        declared = importlib.metadata.requires(DISTRIBUTION) or []
-    except importlib.metadata.PackageNotFoundError:
-        return
-    for requirement in map(Requirement, declared):
-        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
-            continue
-        try:
-            version = importlib.metadata.version(requirement.name)
-        except importlib.metadata.PackageNotFoundError:
-            yield Check(
-                "packages", requirement.name, f"not installed, {requirement.specifier or 'any version'} needed", MISSING, _install(requirement.name)
-            )
-            continue
-        fits = requirement.specifier.contains(version, prereleases=True)
-        state, fix = (OK, "") if fits else (MISSING, _install(f"{requirement.name}{requirement.specifier}"))
-        yield Check("packages", requirement.name, version if fits else f"{version}, {requirement.specifier} needed", state, fix)
-
-
-def _install(requirement: str) -> str:
-    """A checkout pins all of its packages; elsewhere pip has to find them."""
-    return "make environment" if (content.root() / "Makefile").is_file() else f"pip install '{requirement}'"
-
-
-def _display() -> Iterator[Check]:
-    from osel_sim.sim import gl
-
-    try:
-        backend = gl.find_backend()
-        how = "from MUJOCO_GL" if backend.how == "MUJOCO_GL" else "found by probing"
-        yield Check("display", "OpenGL", f"{backend.name}, {how}, draws with {_renderer()}")
-    except DisplayError as error:
-        problem, _, advice = str(error).partition(". ")
-        yield Check("display", "OpenGL", problem, MISSING, advice)
-
-
-def _renderer() -> str:
-    """What draws: a graphics card's name, or Mesa's software renderer (llvmpipe)."""
-    from osel_sim.sim import gl
-
-    context = gl.context(16, 16)
-    context.make_current()
-    try:
-        from OpenGL import GL
-
-        return bytes(GL.glGetString(GL.GL_RENDERER)).decode(errors="replace")
-    finally:
-        context.free()
-
-
-def _machine() -> Iterator[Check]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    yield Check("machine", "cores", str(cores))
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
-    enough = memory >= MINIMUM_MEMORY
-    yield Check("machine", "memory", f"{memory:.1f} GiB", OK if enough else NOTE, "" if enough else f"a run wants {MINIMUM_MEMORY:.0f} GiB")
-    yield Check("machine", "free disk space here", f"{shutil.disk_usage(Path.cwd()).free / 2**30:.1f} GiB")
-    yield _gpu()
-
-
-def _gpu() -> Check:
-    try:
-        import torch
-    except (ImportError, OSError) as error:
-        return Check("machine", "GPU", f"torch cannot be imported ({str(error).splitlines()[0]})", MISSING, _install("torch"))
-    if torch.cuda.is_available():
-        return Check("machine", "GPU", f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}")
-    if shutil.which("nvidia-smi") is not None:
-        return Check(
-            "machine", "GPU", "there is an NVIDIA driver, but torch does not see a GPU", NOTE, f"a torch built for it (this one: {torch.__version__})"
-        )
-    return Check("machine", "GPU", "none; nothing needs one, training is quicker with it", NOTE)
-
-
-def _tasks(folder: Path | None) -> Iterator[Check]:
-    found = content.files("tasks", folder)
-    if not found:
-        yield Check("tasks", "none", f"no task file in {content.root() / 'tasks'}", MISSING, _install(DISTRIBUTION))
-    for name, file in found.items():
-        try:
-            yield Check("tasks", name, load_task_file(file).title)
-        except ContentError as error:
-            yield Check("tasks", name, str(error), MISSING, f"correct {file.name}")
-
-
-def _policies(folder: Path | None) -> Iterator[Check]:
-    found = content.files("policies", folder)
-    if not found:
-        yield Check("policies", "none", f"no policy file in {content.root() / 'policies'}", MISSING, _install(DISTRIBUTION))
-    for name, file in found.items():
-        try:
-            yield _checkpoint(load_policy_file(file))
-        except ContentError as error:
-            yield Check("policies", name, str(error), MISSING, f"correct {file.name}")
-
-
-def _checkpoint(policy: PolicySpec) -> Check:
-    """Whether a policy's checkpoint is on this machine, and whole."""
-    if policy.remote is not None and policy.remote.url is not None:
-        return Check("policies", policy.name, f"served at {policy.remote.url} (not tried)", NOTE)
-    if not policy.checkpoint:
-        return Check("policies", policy.name, f"{policy.kind}, needs no checkpoint")
-    place = content.resolve_checkpoint(policy.checkpoint)
-    if isinstance(place, Path):
-        return _weights("policies", policy.name, place, f"python -m osel_sim.train --policy {policy.name} --data DIR --out {place}")
-    if policy.checkpoint.count("/") == 1 and not Path(policy.checkpoint).is_absolute():
-        return Check("policies", policy.name, f"hub checkpoint {policy.checkpoint} (not tried)", NOTE)
-    train = f"python -m osel_sim.train --policy {policy.name} --data DIR --out {policy.checkpoint}"
-    return Check("policies", policy.name, f"checkpoint folder {policy.checkpoint} is missing", MISSING, train)
-
-
-def _encoder() -> Iterator[Check]:
-    from osel_sim.context.encoder import DEFAULT_ENCODER
-
-    folder = content.root() / "assets" / "encoders" / DEFAULT_ENCODER
-    train = f"python -m osel_sim.train --encoder --data DIR --out {folder}"
-    if folder.is_dir():
-        yield _weights("encoder", DEFAULT_ENCODER, folder, train, "open_clip_config.json")
-    else:
-        yield Check("encoder", DEFAULT_ENCODER, "is missing", MISSING, train)
-
-
-def _weights(area: str, name: str, folder: Path, fix: str, config: str = CONFIG) -> Check:
-    """Whether a folder holds its configuration and at least one complete safetensors file; counts the parameters."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        json.loads((folder / config).read_bytes())
-    except (OSError, ValueError):
-        return Check(area, name, f"{config} in {folder} is missing or no JSON", MISSING, fix)
-    # Processors keep their statistics in safetensors files of their own.
-    files = sorted(file for file in folder.glob("*.safetensors") if "processor" not in file.name)
-    if not files:
-        return Check(area, name, f"no safetensors file in {folder}", MISSING, fix)
-    parameters = 0
-    for file in files:
-        try:
-            # Opening compares the file's length with what its header says.
-            with safe_open(file, framework="numpy") as tensors:
-                parameters += sum(_product(tensors.get_slice(key).get_shape()) for key in tensors.keys())  # noqa: SIM118 (not a dictionary)
-        except (OSError, SafetensorError) as error:
-            return Check(area, name, f"{file} is not a whole safetensors file ({error})", MISSING, fix)
-    return Check(area, name, f"checkpoint is whole, {parameters / 1e6:.1f}M parameters")
-
-
-def _product(shape: list[int]) -> int:
-    total = 1
-    for size in shape:
-        total *= size
-    return total
 
 
 def _print(checks: list[Check], ready: bool) -> None:
@@ -279,5 +85,7 @@ def _print(checks: list[Check], ready: bool) -> None:
     console().print("ready to run" if ready else f"{missing} {'thing is' if missing == 1 else 'things are'} missing")
 
 
+main = Command("doctor", DoctorConfig, _execute, EXAMPLES)
+
 if __name__ == "__main__":
-    sys.exit(main(None))
+    sys.exit(main())

@@ -1,6 +1,5 @@
 """Serve a policy file over WebSocket: `python -m osel_sim.serve remote_large --port 8000`."""
 
-import argparse
 import asyncio
 import json
 import logging
@@ -11,10 +10,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
-from osel_sim.core.errors import OselError, UsageError
+from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
+from osel_sim.cli.command import Command
+from osel_sim.core.errors import SettingError, UsageError
+from osel_sim.core.shown import shown
+from osel_sim.core.trust import trusting
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 
 if TYPE_CHECKING:
@@ -31,63 +33,65 @@ Clients are osel_sim itself (url = "ws://host:8000" in a policy file) and openpi
 One line of JSON on standard output says when it is ready. GET /healthz needs no token."""
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command; the exit code."""
-    options = _parser().parse_args(arguments)
-    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", level=logging.WARNING)
-    if options.watch_stdin:
+@settings
+class ServeConfig(TrustSettings):
+    """Serve a policy over WebSocket (openpi's protocol)."""
+
+    policy: str
+    """name of a policy file; python -m osel_sim.run --list shows them"""
+    host: Annotated[str, MAIN] = "127.0.0.1"
+    """address to listen on; the default is reached from this machine only"""
+    port: Annotated[int, MAIN] = 8000
+    """port, 0 for a free one"""
+    token_env: Annotated[str, MAIN] = TOKEN_VARIABLE
+    """environment variable with the token"""
+    policies_dir: Annotated[Folder | None, CONTENT] = None
+    """folder with policy files of your own"""
+    watch_stdin: Annotated[bool, OTHER] = False
+    """stop when standard input ends (for a program that starts the server)"""
+
+
+def _execute(config: ServeConfig) -> int:
+    handler = logging.StreamHandler()
+    handler.setFormatter(_Formatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
+    if config.watch_stdin:
         threading.Thread(target=_stop_with_stdin, daemon=True).start()
-    try:
-        return _serve(options)
-    except OselError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        return 130
+    with trusting(config.trust):
+        return _serve(config)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m osel_sim.serve",
-        description="Serve a policy over WebSocket (openpi's protocol).",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("policy", help="name of a policy file; python -m osel_sim.run --list shows them")
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s, reached from this machine only)")
-    parser.add_argument("--port", type=int, default=8000, help="port, 0 for a free one (default: %(default)s)")
-    parser.add_argument("--token-env", default=TOKEN_VARIABLE, metavar="VARIABLE", help="environment variable with the token (default: %(default)s)")
-    parser.add_argument("--policies-dir", type=Path, metavar="DIR", help="folder with policy files of your own")
-    parser.add_argument("--watch-stdin", action="store_true", help="stop when standard input ends (for a program that starts the server)")
-    return parser
-
-
-def _serve(options: argparse.Namespace) -> int:
+def _serve(config: ServeConfig) -> int:
+    if not 0 <= config.port <= 65535:
+        raise SettingError("port", f"must lie in [0, 65535], got {config.port}")
     from osel_sim.formats import library
 
-    if not 0 <= options.port <= 65535:
-        raise UsageError(f"--port must lie in [0, 65535], got {options.port}")
-    spec = library.load_policy(options.policy, options.policies_dir)
-    given = os.environ.get(options.token_env)
+    spec = library.load_policy(config.policy, config.policies_dir)
+    given = os.environ.get(config.token_env)
 
-    from osel_sim.policy.registry import load_policy
+    from osel_sim.policy.registry import session_factory
     from osel_sim.remote.server import PolicyServer, is_loopback, warm_up
 
-    if given is None and not is_loopback(options.host):
-        raise UsageError(f"--host {options.host} can be reached from other machines: put a token into the environment variable {options.token_env}")
+    if given is None and not is_loopback(config.host):
+        raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
     greeting = Greeting.of(spec)
-    make_session = load_policy(spec)
+    make_session = session_factory(spec)
     warm_up(make_session, greeting)
-    server = PolicyServer(make_session, greeting, token, options.host, options.port)
+    server = PolicyServer(make_session, greeting, token, config.host, config.port)
 
     def ready(port: int) -> None:
-        host = f"[{options.host}]" if ":" in options.host else options.host
+        host = f"[{config.host}]" if ":" in config.host else config.host
         line = {"policy": spec.name, "url": f"ws://{host}:{port}", "port": port}
         print(json.dumps(line if given is not None else {**line, "token": token}), flush=True)
 
     _run_until_signal(server, ready)
     return 0
+
+
+class _Formatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return shown(super().format(record))  # clients have a say in it
 
 
 def _run_until_signal(server: "PolicyServer", ready: Callable[[int], None]) -> None:
@@ -112,6 +116,8 @@ def _stop_with_stdin() -> None:
     time.sleep(10.0)
     os._exit(1)  # whatever kept it
 
+
+main = Command("serve", ServeConfig, _execute, EXAMPLES)
 
 if __name__ == "__main__":
     sys.exit(main())

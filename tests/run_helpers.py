@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from osel_sim.core import content
@@ -28,7 +29,7 @@ class Wander:
     def act(self, observation):
         self.calls += 1
         who = "server" if "osel_sim.serve" in " ".join(sys.orig_argv) else observation["task"]
-        if os.environ.get("WANDER_DIES_ON") == who and self.calls == 2:
+        if os.environ.get("WANDER_DIES_ON") in (who, "everything") and self.calls == 2:
             os.kill(os.getpid(), 9)
         image = observation["observation.images.agentview"]
         drift = float(image.mean()) / 255 + float(observation["observation.state"][0])
@@ -146,3 +147,16 @@ def wait_for_lines(process: subprocess.Popen, file: Path, lines: int) -> None:
         assert process.poll() is None, process.stderr.read()
         assert time.monotonic() < end
         time.sleep(0.02)
+
+
+def children(process: subprocess.Popen) -> set[int]:
+    """Process ids of what a process started from its main thread and has not buried."""
+    return set(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
+
+
+def wait_until(condition: Callable[[], object], seconds: float) -> bool:
+    """Whether a condition is met in time."""
+    end = time.monotonic() + seconds
+    while not (met := condition()) and time.monotonic() < end:
+        time.sleep(0.005)
+    return bool(met)

@@ -2,63 +2,147 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
+from typing import Annotated, Literal
 
 import pytest
 
-from osel_sim import cli
-from osel_sim.core.errors import UsageError
+from osel_sim.__main__ import COMMANDS, main
+from osel_sim.api.settings import MAIN, Count, Folder, Index, Levels, NonNegative, Settings, settings
+from osel_sim.cli.command import BROKEN_PIPE, Command, descriptions, reported
+from osel_sim.core.errors import SettingError, UnknownNameError, UsageError
 
 
-def parser() -> cli.Parser:
-    result = cli.Parser("demo", "Does nothing.", "examples:\n  python -m osel_sim.demo --episodes 3")
-    result.add_argument("--episodes", type=cli.positive_int)
-    result.add_argument("--alpha", type=cli.non_negative_float)
-    result.add_argument("--seed", type=cli.non_negative_int)
-    result.add_argument("--tasks", type=cli.folder)
-    result.add_argument("--split", choices=("train", "validation", "test"))
-    return result
+@settings
+class DemoConfig(Settings):
+    """Does nothing."""
+
+    word: Annotated[str, MAIN] = ""
+    """a word"""
+    episodes: Count = 3
+    """how many"""
+    alpha: NonNegative = 0.0
+    seed: Index = 0
+    level: Levels = (0,)
+    tasks: Folder | None = None
+    split: Literal["train", "validation", "test"] = "test"
+
+
+@settings
+class LogConfig(Settings):
+    """Needs a log."""
+
+    log: Path
+    """the log"""
+
+
+def show(config: Settings) -> int:
+    print(json.dumps(config.to_json()))
+    return 0
+
+
+demo = Command("demo", DemoConfig, show, "examples:\n  python -m osel_sim.demo --episodes 3")
+needs_log = Command("demo", LogConfig, show, "")
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--episodes 0", "argument --episodes: must be 1 or more, got 0"),
-        ("--episodes many", "argument --episodes: must be an integer, got 'many'"),
-        ("--episodes", "argument --episodes: expected one argument"),
-        ("--alpha -0.1", "argument --alpha: must be a number of 0 or more, got -0.1"),
-        ("--alpha nan", "argument --alpha: must be a number of 0 or more, got nan"),
-        ("--alpha much", "argument --alpha: must be a number, got 'much'"),
-        ("--seed -1", "argument --seed: must be 0 or more, got -1"),
-        ("--tasks /no/such", "argument --tasks: there is no folder /no/such"),
-        ("--tasks /dev/null", "argument --tasks: /dev/null is not a folder"),
-        ("--split tets", "argument --split: unknown value 'tets': did you mean 'test'? known: train, validation, test"),
-        ("--epsodes 3", "unknown argument '--epsodes': did you mean '--episodes'? python -m osel_sim.demo --help lists them"),
+        ("--episodes 0", "--episodes: must be 1 or more, got 0"),
+        ("--episodes many", "--episodes: must be an integer, got 'many'"),
+        ("--episodes", "--episodes: needs a value"),
+        ("--alpha -0.1", "--alpha: must be 0 or more, got -0.1"),
+        ("--alpha nan", "--alpha: must be a finite number, got nan"),
+        ("--alpha much", "--alpha: must be a number, got 'much'"),
+        ("--seed -1", "--seed: must be 0 or more, got -1"),
+        ("--level", "--level: needs at least one value"),
+        ("--level 0 -1", "--level: must be 0 or more, got -1"),
+        ("--tasks /no/such", "--tasks: there is no folder /no/such"),
+        ("--tasks /dev/null", "--tasks: /dev/null is not a folder"),
+        ("--split tets", "--split: unknown value 'tets': did you mean 'test'? known: train, validation, test"),
+        ("--epsodes 3", "unknown argument '--epsodes': did you mean '--episodes'? --help lists them"),
         ("--epi 3", "unknown argument '--epi'"),
+        ("stray", "unknown argument 'stray'"),
     ],
 )
 def test_wrong_flags_get_one_line_and_exit_code_2(arguments: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        parser().parse_args(arguments.split())
+    assert demo(arguments.split()) == 2
     error = capsys.readouterr().err
-    assert ended.value.code == 2
     assert error.startswith("error: ")
     assert message in error
     assert error.count("\n") == 1
 
 
-def test_help_shows_the_examples(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        parser().parse_args(["--help"])
-    assert ended.value.code == 0
-    assert "  python -m osel_sim.demo --episodes 3\n" in capsys.readouterr().out
+def test_a_flag_given_twice_means_the_last_one(capsys: pytest.CaptureFixture[str]) -> None:
+    assert demo(["--level", "0", "2", "--episodes=4", "--level", "1", "--episodes", "5"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["level"], found["episodes"]) == ([1], 5)
 
 
-def raises(error: BaseException) -> cli.Command:
-    def command(arguments: list[str] | None = None) -> int:
+def test_a_positional_setting_is_needed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert needs_log([]) == 2
+    assert capsys.readouterr().err == "error: LOG is missing\n"
+    assert needs_log(["here"]) == 0
+
+
+def test_help_shows_fields_and_the_examples_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert demo(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert "how many [default: 3]" in out and out.index("What matters most") < out.index("--episodes")
+    assert "  python -m osel_sim.demo --episodes 3\n" in out
+
+
+@pytest.mark.parametrize("name", ["settings.toml", "settings.json", "run.json"])
+def test_a_file_gives_settings_and_flags_beside_it_win(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = {"episodes": 7, "level": [0, 2], "word": "x"}
+    text = {"settings.toml": '\ufeffepisodes = 7\nlevel = [0, 2]\nword = "x"\n', "settings.json": json.dumps(values)}
+    (tmp_path / name).write_text(text.get(name, json.dumps({"settings": values, "configuration": {}})), encoding="utf-8")
+    assert demo(["--config", str(tmp_path / name), "--episodes", "9"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["episodes"], found["level"], found["word"], found["seed"]) == (9, [0, 2], "x", 0)
+    (tmp_path / "wrong.toml").write_text("episods = 3\n")
+    assert demo(["--config", str(tmp_path / "wrong.toml")]) == 2
+    assert "unknown setting 'episods': did you mean 'episodes'?" in capsys.readouterr().err
+
+
+def test_a_configuration_is_checked_where_it_is_made_and_survives_json() -> None:
+    config = DemoConfig.of(level=2, episodes=4)
+    assert config.level == (2,) and config.given == {"level", "episodes"}
+    assert DemoConfig.of(**json.loads(json.dumps(config.to_json()))) == config
+    with pytest.raises(UnknownNameError, match="did you mean 'episodes'"):
+        DemoConfig.of(episods=4)
+    with pytest.raises(SettingError, match=r"episodes: must be an integer, got 'x'"):
+        config.changed(episodes="x")
+    with pytest.raises(SettingError, match="did you mean 'test'"):
+        DemoConfig.of(split="tets")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_setting_of_every_command_is_explained(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    command = import_module(f"osel_sim.{name}")
+    for each in [command.main] if isinstance(command.main, Command) else [command.policy_command, command.encoder_command]:
+        described = descriptions(each.config)
+        assert [field.name for field in fields(each.config) if not described.get(field.name)] == []
+    assert main([name, "--help"]) == 0
+    assert "examples:" in capsys.readouterr().out
+
+
+def test_the_console_script_lists_commands_and_corrects_names(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    listed = capsys.readouterr().out
+    assert all(f"  {name} " in listed for name in COMMANDS)
+    assert main(["rekord"]) == 2
+    assert "unknown command 'rekord': did you mean 'record'?" in capsys.readouterr().err
+
+
+def raises(error: BaseException) -> Callable[[], int]:
+    def command() -> int:
         raise error
 
-    return cli.main(command)
+    return command
 
 
 @pytest.mark.parametrize(
@@ -71,23 +155,23 @@ def raises(error: BaseException) -> cli.Command:
     ],
 )
 def test_errors_become_one_line_and_an_exit_code(error: BaseException, code: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert raises(error)(None) == code
+    assert reported(raises(error)) == code
     assert capsys.readouterr().err == message
 
 
 def test_mistakes_of_ours_keep_their_traceback() -> None:
     with pytest.raises(ZeroDivisionError):
-        raises(ZeroDivisionError())(None)
+        reported(raises(ZeroDivisionError()))
 
 
 def test_a_reader_that_has_gone_ends_a_command_quietly() -> None:
-    code = "import sys; from osel_sim import cli; sys.exit(cli.main(lambda a: [print('x' * 9999) for _ in range(999)] and 0)(None))"
+    code = "import sys; from osel_sim.cli.command import reported; sys.exit(reported(lambda: [print('x' * 9999) for _ in range(999)] and 0))"
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stderr is not None
         process.stdout.read(1)
         process.stdout.close()
         assert process.stderr.read() == b""
-    assert process.returncode == cli.BROKEN_PIPE
+    assert process.returncode == BROKEN_PIPE
 
 
 @pytest.mark.parametrize("flag", ["--list", "--help"])

@@ -18,8 +18,8 @@ from osel_sim.core.errors import CheckpointError, DataError, UnknownNameError, U
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.encoder import Encoder
 from osel_sim.training.encoder.captions import PLACES, Caption, Captions, truth
-from osel_sim.training.encoder.evaluate import measure, neighbour_agreement
-from osel_sim.training.encoder.scenes import Scenes, render_scenes
+from osel_sim.training.encoder.evaluate import measure_task, neighbour_agreement
+from osel_sim.training.encoder.scenes import Scenes, render_instances
 
 TINY = "tiny_open_clip"
 
@@ -36,7 +36,7 @@ def encoder() -> Encoder:
 
 @pytest.fixture(scope="module")
 def scenes(task: TaskSpec) -> Scenes:
-    return render_scenes(task, range(5000, 5120), "test", 96)
+    return render_instances(task, range(5000, 5120), "test", 96)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_unseen_instances_with_the_same_object_lie_together(scenes: Scenes, cont
 
 
 def test_pictures_find_their_instructions_on_unseen_scenes(encoder: Encoder, task: TaskSpec, scenes: Scenes) -> None:
-    measured = measure(encoder, task, scenes)  # type: ignore[arg-type]
+    measured = measure_task(encoder, task, scenes)  # type: ignore[arg-type]
     assert measured["image_to_instruction"]["trained_phrasings"] > 0.8
     assert measured["image_to_instruction"]["held_out_phrasings"] > 0.7
     assert measured["instruction_to_image"]["held_out_phrasings"] > 0.7
@@ -102,7 +102,7 @@ def test_pictures_find_their_instructions_on_unseen_scenes(encoder: Encoder, tas
 
 def test_the_encoder_of_all_tasks_tells_them_apart() -> None:
     tasks = [load_task_file(content.find("tasks", name)) for name in ("lift", "push", "open_drawer", "press_button")]
-    scenes = [render_scenes(task, range(8), "test", 96, (0, 2)) for task in tasks]
+    scenes = [render_instances(task, range(8), "test", 96, (0, 2)) for task in tasks]
     pictured = [([image], text) for one in scenes for image, text in zip(one.images, one.instructions.tolist(), strict=True)]
     contexts = encode_many(load_encoder("osel_suite"), pictured)
     near = contexts @ contexts.T - 9.0 * np.eye(len(contexts))
@@ -110,11 +110,11 @@ def test_the_encoder_of_all_tasks_tells_them_apart() -> None:
 
 
 def test_levels_of_scenes_take_turns(task: TaskSpec) -> None:
-    turned = render_scenes(task, range(2), "train", 48, (0, 2))
+    turned = render_instances(task, range(2), "train", 48, (0, 2))
     for seed, level in ((0, 0), (1, 2)):
-        alone = render_scenes(task, [seed], "train", 48, (level,))
+        alone = render_instances(task, [seed], "train", 48, (level,))
         np.testing.assert_array_equal(turned.images[seed], alone.images[0])
-    assert not np.array_equal(turned.images[1], render_scenes(task, [1], "train", 48).images[0])
+    assert not np.array_equal(turned.images[1], render_instances(task, [1], "train", 48).images[0])
 
 
 @pytest.mark.parametrize("image", [np.zeros((96, 96), np.uint8), np.zeros((96, 96, 3), np.float32), np.zeros((3, 96, 96), np.uint8)])
@@ -284,9 +284,9 @@ def test_an_instruction_is_drawn_to_its_task_where_there_are_several() -> None:
 def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from osel_sim.training.encoder import recipe
     from osel_sim.training.encoder import train as training
-    from osel_sim.training.encoder.train import Settings, train
+    from osel_sim.training.encoder.train import EncoderSettings, train
 
-    settings = Settings(tasks=("pick_place", "sort"), levels=(0, 2), steps=4, scenes=24, test_scenes=12, views=8, texts=8)
+    settings = EncoderSettings(tasks=("pick_place", "sort"), levels=(0, 2), steps=4, scenes=24, test_scenes=12, views=8, texts=8)
     whole = train(settings, tmp_path, tmp_path / "whole")
     batches: list[recipe.Batch] = []
     make_batch = recipe.make_batch
@@ -299,9 +299,9 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(recipe, "make_batch", interrupted)
-        patch.setattr(training, "SAVE_SECONDS", -1.0)  # after every step
+        patch.setattr(training, "SAVE_EVERY", 1)
         train(settings, tmp_path, tmp_path / "cut")
-    assert (tmp_path / "cut" / "training_state.pt").exists()
+    assert (tmp_path / "cut" / "training.state").exists()
     with pytest.raises(CheckpointError, match="was trained with seed 0"):
         train(replace(settings, seed=1), tmp_path, tmp_path / "cut", resume=True)
     train(settings, tmp_path, tmp_path / "cut", resume=True)
@@ -309,10 +309,27 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
     measured = whole["measured"]
     assert measured["task"]["neighbours"]["chance"] == 0.5
     assert "image_to_instruction" in measured["tasks"]["pick_place"] and "image_to_instruction" not in measured["tasks"]["sort"]  # names no object
-    assert whole["settings"]["steps"] == 4 and not (tmp_path / "cut" / "training_state.pt").exists()
+    assert whole["settings"]["steps"] == 4 and not (tmp_path / "cut" / "training.state").exists()
     assert load_encoder(str(tmp_path / "whole")).dimension == 256
     with pytest.raises(UsageError, match="holds a checkpoint already"):
         train(settings, tmp_path, tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"steps": 0}, "steps must be 1 or more"),
+        ({"views": 0}, "views must be 1 or more"),
+        ({"levels": (0, 4)}, "unknown level '4'"),
+        ({"tasks": ()}, "at least one task"),
+        ({"rate": float("nan")}, "rate must be a positive number"),
+    ],
+)
+def test_settings_are_checked_when_they_are_made(settings: dict[str, Any], says: str) -> None:
+    from osel_sim.training.encoder.train import EncoderSettings
+
+    with pytest.raises(UsageError, match=says):
+        EncoderSettings(**settings)
 
 
 @pytest.mark.parametrize(
@@ -320,8 +337,8 @@ def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp
     [
         (["--encoder", "osel_smal"], "did you mean 'osel_small'"),
         (["--task", "pick_plac"], "did you mean 'pick_place'"),
-        (["--steps", "0"], "--steps must be 1 or more, got 0"),
-        (["--minutes", "-1"], "--minutes must be more than 0"),
+        (["--steps", "0"], "--steps: must be 1 or more, got 0"),
+        (["--minutes", "-1"], "--minutes: must be more than 0"),
     ],
 )
 def test_wrong_training_arguments_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], says: str) -> None:

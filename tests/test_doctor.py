@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from osel_sim import doctor
+from osel_sim.cli import machine_checks
 from osel_sim.core import content
 from osel_sim.doctor import Check
 
@@ -23,7 +23,7 @@ def policy(folder: Path, checkpoint: str) -> Check:
     folder.mkdir(exist_ok=True)
     text = (content.root() / "policies" / "local_small.toml").read_text()
     (folder / "mine.toml").write_text(text.replace('"local_small"', '"mine"').replace("assets/policies/local_small", checkpoint))
-    return next(check for check in doctor._policies(folder) if check.name == "mine")
+    return next(check for check in machine_checks._policies(folder) if check.name == "mine")
 
 
 def test_a_whole_checkpoint_is_counted(tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_a_missing_checkpoint_folder_is_not_taken_for_a_hub_name(tmp_path: Path)
 
 def test_a_broken_policy_file_is_reported_with_its_key(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('version = 1\nname = "mine"\nlocation = "lokal"\n')
-    found = next(check for check in doctor._policies(tmp_path) if check.name == "mine")
+    found = next(check for check in machine_checks._policies(tmp_path) if check.name == "mine")
     assert (found.state, found.fix) == ("missing", "correct mine.toml")
     assert "location: unknown value 'lokal', did you mean 'local'?" in found.found
 
@@ -81,7 +81,7 @@ def test_the_command_reports_every_area_and_its_exit_code_agrees(tmp_path: Path)
 
 def test_without_opengl_it_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "eggl")
-    (found,) = doctor._display()
+    (found,) = machine_checks._display()
     assert found.state == "missing"
     assert "known: egl, osmesa, glfw" in found.found + found.fix
 

@@ -11,10 +11,10 @@ import pyarrow.parquet
 import pytest
 from PIL import Image
 
-from osel_sim import ingest
 from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
 from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.ingest import main as ingest_main
 from osel_sim.selection.reward import RewardWeights, preset
 
 SUBJECTS = {"anatomy": "Which bone is part of the hand?", "astronomy": "Which planet is nearest to the sun?"}
@@ -54,7 +54,7 @@ def quiz(folder: Path) -> Path:
 
 
 def run(*arguments: object) -> int:
-    return ingest.main([str(argument) for argument in arguments])
+    return ingest_main([str(argument) for argument in arguments])
 
 
 def refused(capsys: pytest.CaptureFixture[str], out: Path, *arguments: object) -> str:

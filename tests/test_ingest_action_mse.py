@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from synthetic_demonstrations import STEPS, write
 
-from osel_sim import ingest
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.episodes.loop import Driver
 from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts
-from osel_sim.ingestion.action_mse import Settings, action_mse, measure_one, open_datasets
+from osel_sim.ingest import main as ingest_main
+from osel_sim.ingestion.action_mse import Measurement, action_mse, measure_one, open_datasets
 from osel_sim.policy.local import LocalCaller
 
 EPISODES = 2
@@ -29,7 +29,7 @@ def test_error_by_hand():
 
 
 def test_samples_are_spread_over_each_episode_and_are_what_was_logged(dataset):
-    samples = open_datasets([dataset], [library.load_policy("local_small")], Settings(frames=3))
+    samples = open_datasets([dataset], [library.load_policy("local_small")], Measurement(frames=3))
     assert [sample.instance.key for sample in samples[:3]] == ["flat_world/000000/000000", "flat_world/000000/000004", "flat_world/000000/000008"]
     assert len(samples) == 3 * EPISODES
     last = samples[-1]
@@ -60,7 +60,7 @@ class Replays:
 
 def test_who_knows_the_answer_has_no_error_and_a_crash_is_no_score(dataset):
     spec = library.load_policy("local_small")
-    sample = open_datasets([dataset], [spec], Settings(frames=3))[2]
+    sample = open_datasets([dataset], [spec], Measurement(frames=3))[2]
     logged = np.zeros((50, 7), np.float32)
     own = sample.dataset.actions[sample.frame : sample.end]
     logged[: len(own)] = own * 0.5
@@ -81,7 +81,7 @@ def test_who_knows_the_answer_has_no_error_and_a_crash_is_no_score(dataset):
 def test_shipped_policies_are_measured(dataset, tmp_path):
     out = tmp_path / "log"
     command = ["--metric", "action-mse", "--dataset", dataset, "--policies", "local_small", "remote_large", "--frames", 2, "--tolerance", 0.3]
-    assert ingest.main([str(item) for item in [*command, "--out", out]]) == 0
+    assert ingest_main([str(item) for item in [*command, "--out", out]]) == 0
     rows, metadata = read_rollouts(out)
     assert [row.policy for row in rows] == ["local_small", "remote_large"] * 2 * EPISODES
     assert all(row.error is None and row.score is not None and -4 < row.score < 0 for row in rows)
@@ -97,20 +97,20 @@ def test_shipped_policies_are_measured(dataset, tmp_path):
 def test_bad_datasets_get_one_line(dataset, tmp_path, capsys):
     spec = [library.load_policy("remote_large")]
     with pytest.raises(DataError, match=r"is no LeRobotDataset, it has no meta/info\.json"):
-        open_datasets([tmp_path], spec, Settings())
+        open_datasets([tmp_path], spec, Measurement())
     with pytest.raises(DataError, match=r"no images 'observation\.images\.top' .*--camera wrist=COLUMN"):
-        open_datasets([dataset], spec, Settings(cameras={"wrist": "observation.images.top"}))
+        open_datasets([dataset], spec, Measurement(cameras={"wrist": "observation.images.top"}))
     other = write(tmp_path / "one_eye", 1, annotated=False)
     with pytest.raises(DataError, match=r"did you mean 'observation\.images\.agentview'.*--camera wrist=COLUMN"):
-        open_datasets([other], spec, Settings())
-    assert open_datasets([other], spec, Settings(cameras={"wrist": "observation.images.agentview"}))
+        open_datasets([other], spec, Measurement())
+    assert open_datasets([other], spec, Measurement(cameras={"wrist": "observation.images.agentview"}))
     for file in other.glob("data/**/*.parquet"):
         file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(DataError, match="one_eye: cannot be read as a LeRobotDataset"):
-        open_datasets([other], [library.load_policy("local_small")], Settings())
+        open_datasets([other], [library.load_policy("local_small")], Measurement())
     flags = ["--metric", "action-mse", "--dataset", str(dataset), "--policies", "local_small", "--out", str(tmp_path / "log")]
-    assert ingest.main([*flags, "--camera", "wrist"]) == 2
-    assert ingest.main([*flags, "--camera", "wrist=observation.images.wrist"]) == 2
+    assert ingest_main([*flags, "--camera", "wrist"]) == 2
+    assert ingest_main([*flags, "--camera", "wrist=observation.images.wrist"]) == 2
     error = capsys.readouterr().err
     assert "--camera must be CAMERA=COLUMN, got 'wrist'" in error
     assert "--camera wrist: no policy has that camera" in error

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from osel_sim import replay
 from osel_sim.analysis.evaluation import evaluate
 from osel_sim.analysis.live import is_live_run, read_live
 from osel_sim.context.cache import ContextCache
@@ -16,6 +15,7 @@ from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, to_line
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.interface.outcome import Outcome, Seconds
+from osel_sim.replay import main as replay_main
 from osel_sim.selection.reward import RewardWeights
 
 FREE = RewardWeights(0.0, 0.0)
@@ -68,7 +68,7 @@ def make_run(folder: Path, decisions: int = 400, counterfactual: bool = False) -
 def test_estimates_from_the_propensities(tmp_path, capsys):
     run = make_run(tmp_path / "run")
     assert is_live_run(run) and not is_live_run(tmp_path)
-    assert replay.main([str(run), "--out", str(tmp_path / "out")]) == 0
+    assert replay_main([str(run), "--out", str(tmp_path / "out")]) == 0
     found = read_json(tmp_path / "out" / "off_policy.json")
     assert found["run"]["decisions"] == 399 and found["run"]["errors"] == 1 and found["reward"] == asdict(FREE)
     for policy, rate in RATES.items():
@@ -80,7 +80,7 @@ def test_estimates_from_the_propensities(tmp_path, capsys):
     assert found["targets"]["fixed:local"]["effective_decisions"] > 250 > found["targets"]["fixed:remote"]["effective_decisions"]
     printed = capsys.readouterr().out
     assert "--counterfactual" in printed and "1 decisions that ended in error" in printed
-    assert replay.main([str(run), "--out", str(tmp_path / "out")]) == 2
+    assert replay_main([str(run), "--out", str(tmp_path / "out")]) == 2
 
 
 def test_errors_of_one_policy_do_not_favour_the_other(tmp_path):
@@ -105,7 +105,7 @@ def test_with_all_outcomes_it_is_a_log(tmp_path):
     live = read_live(run)
     assert live.has_all_outcomes(FREE) and np.isfinite(live.outcomes.success).sum() == 2 * 120 - 1
     arguments = ["--selectors", "random", "--seeds", "2", "--workers", "1", "--out", str(tmp_path / "out")]
-    assert replay.main([str(run), *arguments]) == 0
+    assert replay_main([str(run), *arguments]) == 0
     result, _ = read_replay(tmp_path / "out")
     assert result["log"]["instances"] == 119 and result["off_policy"]["run"]["decisions"] == 119
     assert result["reward"]["alpha_time"] == 0.0 and result["verdict"]["policy"] == "remote"

@@ -1,24 +1,28 @@
-"""`python -m osel_sim.record` with real workers and servers: the same bytes however it went, and a dying worker costs one episode."""
+"""`python -m osel_sim.record` with real workers and servers: the same bytes however it went, and workers that die."""
 
+import dataclasses
 import json
+import os
 import shutil
 import signal
 import subprocess
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
+from remote_helpers import alive
+from run_helpers import HORIZON, children, command, environment, execute, make_world, wait_for_lines, wait_until
 
-from osel_sim import record
 from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
 from osel_sim.core import content
 from osel_sim.core.files import digest
 from osel_sim.episodes.workers import Plan
 from osel_sim.formats import library
-from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.record import main as record_main
 
 INSTANCES, REPEATS = 5, 2
 SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)
@@ -168,15 +172,15 @@ def test_a_log_knows_what_its_policies_declare(world, reference):
         run["configuration"]["content"][f"policy {name}"] = digest(file)
     (folder / "run.json").write_text(json.dumps(run))
     arguments = list(map(str, ["--resume", "--out", folder, "--tasks", world / "tasks", "--policies-dir", own]))
-    assert record.main(arguments) == 0
+    assert record_main(arguments) == 0
     log = read_log(folder)
     assert log.skills is not None and log.skills.able == {"calm": ("lift", "push"), "wild": ("short",)}
     assert log.skills.nearest(log.contexts[0]) == "short"
     assert read_rollouts(folder)[0] == read_rollouts(reference[0])[0]
     before = files(folder)
-    assert record.main(arguments) == 0 and files(folder) == before
+    assert record_main(arguments) == 0 and files(folder) == before
     (own / "wild.toml").write_text((own / "wild.toml").read_text().replace('"short"', '"shrt"'))
-    assert record.main([*arguments[:1], "--out", str(world / "undeclared"), "--task", "short", *arguments[3:], "--policies", "wild"][1:]) == 2
+    assert record_main([*arguments[:1], "--out", str(world / "undeclared"), "--task", "short", *arguments[3:], "--policies", "wild"][1:]) == 2
     assert not (world / "undeclared").exists()
 
 
@@ -194,7 +198,7 @@ def test_a_policy_that_cannot_be_added_leaves_the_log_as_it_was(world, reference
     (more / "lost.toml").write_text(lost)
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     more_policies = ("--policies-dir", more, "--policies", "calm", "wild", "lost")
-    assert record.main(list(map(str, command(world, "record", *SIZE, "--out", folder, "--resume", *more_policies)[3:]))) == 2
+    assert record_main(list(map(str, command(world, "record", *SIZE, "--out", folder, "--resume", *more_policies)[3:]))) == 2
     assert "nowhere/at/all" in capsys.readouterr().err
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
 
@@ -206,28 +210,74 @@ def test_an_encoder_that_changed_is_refused_unless_it_is_asked_for(world, refere
     run["configuration"]["encoder"] = "colours@before"
     (folder / "run.json").write_text(json.dumps(run))
     places = ["--tasks", str(world / "tasks"), "--policies-dir", str(world / "policies")]
-    assert record.main(["--resume", "--out", str(folder), *places]) == 2
+    assert record_main(["--resume", "--out", str(folder), *places]) == 2
     assert "encoder was 'colours@before' at the beginning, now it is 'colours'" in capsys.readouterr().err
-    assert record.main(["--resume", "--out", str(folder), *places, "--encoder", "colours"]) == 0
+    assert record_main(["--resume", "--out", str(folder), *places, "--encoder", "colours"]) == 0
 
 
 @pytest.mark.parametrize(("noise", "lengths"), [(0.0, {1}), (0.1, {2, 3})])
 def test_repeats_differ_by_noise_on_actions_alone(tmp_path, noise, lengths):
     folder = tmp_path / "log"
     what = ["--task", "close_drawer", "--policies", "scripted_expert", "--instances", "2", "--repeats", "3"]
-    assert record.main([*what, "--action-noise", str(noise), "--workers", "1", "--out", str(folder)]) == 0
+    assert record_main([*what, "--action-noise", str(noise), "--workers", "1", "--out", str(folder)]) == 0
     steps: dict[str, set[int]] = {}
     for row in read_rollouts(folder)[0]:
         steps.setdefault(row.instance, set()).add(row.steps)
     assert {len(different) for different in steps.values()} <= lengths
 
 
-def test_a_dying_worker_costs_one_episode(world, reference):
+@pytest.mark.slow
+def test_a_worker_that_is_killed_costs_nothing(world, reference):
+    """Its instance goes on where it was, in another worker."""
+    folder = world / "worker_killed"
+    arguments = command(world, "record", *SIZE, "--workers", 1, "--out", folder)
+    process = subprocess.Popen(arguments, env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    wait_for_lines(process, folder / "shards.jsonl", 2)
+    (worker,) = children(process)
+    os.kill(worker, signal.SIGKILL)
+    complaints = process.communicate(timeout=600)[1]
+    assert process.returncode == 0 and "lost" not in complaints
+    assert files(folder) == files(reference[0])
+
+
+@pytest.mark.slow
+def test_workers_that_die_again_and_again_end_the_recording(world, reference):
+    """With one policy there is nothing but deaths: the third instance in a row is the end, or the last where there are fewer."""
+    flags = ("--repeats", 1, "--workers", 1, "--policies", "calm")
+    for instances, words in ((5, "3 jobs in a row"), (1, "no episode was recorded")):
+        folder = world / f"hopeless_{instances}"
+        done = execute(world, "record", *SIZE, *flags, "--instances", instances, "--out", folder, WANDER_DIES_ON="everything")
+        complaint = done.stderr.splitlines()[-1]
+        assert done.returncode == 2 and complaint.startswith("error: ") and words in complaint and "signal 9" in complaint, done.stderr
+        assert not (folder / "rollouts.parquet").exists()
+        assert "Traceback" not in done.stderr
+    resumed = resume(world, world / "hopeless_5")
+    assert resumed.returncode == 0, resumed.stderr
+    whole, _ = read_rollouts(reference[0])
+    assert read_rollouts(world / "hopeless_5")[0] == [row for row in whole if row.policy == "calm" and row.repeat == 0]
+
+
+def test_a_recording_killed_while_its_workers_start_leaves_no_process(world):
+    folder = world / "young"
+    arguments = command(world, "record", *SIZE, "--workers", 2, "--out", folder)
+    process = subprocess.Popen(arguments, env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    assert wait_until(lambda: len(children(process)) == 2, 120)
+    workers = children(process)
+    time.sleep(0.5)  # they import what records episodes
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert wait_until(lambda: not any(map(alive, workers)), 10)
+    assert "Traceback" not in process.stderr.read()
+    process.stderr.close()
+
+
+def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_resume(world, reference):
     """The local policy takes its worker along in one of the instances; everything else is as it would have been."""
     whole, _ = read_rollouts(reference[0])
     victim = whole[2 * REPEATS]
     done = execute(world, "record", *SIZE, "--repeats", 1, "--workers", 1, "--out", world / "dying", WANDER_DIES_ON=victim.instruction)
     assert done.returncode == 0, done.stderr
+    assert f"1 episodes were lost, the first of them of {victim.instance}, policy calm" in done.stderr
     rows, _ = read_rollouts(world / "dying")
     assert len(rows) == 2 * INSTANCES
     for row in rows:
@@ -236,6 +286,21 @@ def test_a_dying_worker_costs_one_episode(world, reference):
             assert not row.success
         else:
             assert row in whole
+    again = resume(world, world / "dying")
+    assert again.returncode == 0 and "lost" not in again.stderr, again.stderr
+    assert read_rollouts(world / "dying")[0] == [row for row in whole if row.repeat == 0]
+    assert "is complete" in resume(world, world / "dying").stdout
+
+
+def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, reference):
+    folder = world / "failed"
+    shutil.copytree(reference[0], folder)
+    rows, metadata = read_rollouts(folder)
+    rows[0] = dataclasses.replace(rows[0], success=False, error="PolicyError: the answer is not finite")
+    write_rollouts(folder, rows, {key: value for key, value in metadata.items() if key != "schema_version"})
+    before = files(folder)
+    done = resume(world, folder)
+    assert done.returncode == 0 and "is complete" in done.stdout and files(folder) == before
 
 
 def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
@@ -256,7 +321,7 @@ def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
 
 
 def test_summary_of_a_log(reference, capsys):
-    assert record.main(["--summary", str(reference[0])]) == 0
+    assert record_main(["--summary", str(reference[0])]) == 0
     output = capsys.readouterr().out
     assert f"{INSTANCES} instances, {2 * INSTANCES * REPEATS} episodes" in output
     for word in ("calm", "wild", "object", "container", "phrasing", "mean reward"):
@@ -266,8 +331,8 @@ def test_summary_of_a_log(reference, capsys):
 def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
     arguments = list(map(str, command(world, "record", *SIZE, "--out", reference[0])[3:]))
     before = files(reference[0])
-    assert record.main([*arguments, "--resume"]) == 0
-    assert "is complete" in capsys.readouterr().out
+    assert record_main([*arguments, "--resume"]) == 0
+    assert "is complete" in capsys.readouterr().err
     assert files(reference[0]) == before
 
 
@@ -287,7 +352,7 @@ def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
 )
 def test_wrong_input_gets_one_line(world, capsys, flags, complaint):
     try:
-        code = record.main([*map(str, command(world, "record", "--out", world / "wrong")[3:]), *flags])
+        code = record_main([*map(str, command(world, "record", "--out", world / "wrong")[3:]), *flags])
     except SystemExit as exit:
         code = exit.code
     text = capsys.readouterr().err
@@ -299,8 +364,8 @@ def test_wrong_input_gets_one_line(world, capsys, flags, complaint):
 
 def test_a_used_folder_or_another_recording_is_refused(world, reference, capsys):
     arguments = list(map(str, command(world, "record", *SIZE, "--out", reference[0])[3:]))
-    assert record.main(arguments) == 2
+    assert record_main(arguments) == 2
     assert "add --resume" in capsys.readouterr().err
-    assert record.main([*arguments, "--resume", "--instances", "6"]) == 2
+    assert record_main([*arguments, "--resume", "--instances", "6"]) == 2
     assert "instances was 5 at the beginning, now it is 6" in capsys.readouterr().err
     assert json.loads((reference[0] / "run.json").read_text())["configuration"]["instances"] == 5

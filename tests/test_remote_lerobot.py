@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from remote_helpers import observation, policy_spec
 
-from osel_sim.policy.registry import load_policy
+from osel_sim.policy.registry import session_factory
 from osel_sim.remote.policy import open_remote
 
 pytestmark = pytest.mark.slow  # each process imports LeRobot
@@ -62,7 +62,7 @@ def spec(tmp_path_factory):
 
 
 def test_the_wire_changes_no_bit(spec):
-    local = load_policy(spec)()
+    local = session_factory(spec)()
     remote = open_remote(spec, timeout=30)
     try:
         random = np.random.default_rng(0)

@@ -211,7 +211,7 @@ def test_own_server_process_answers_and_is_gone_afterwards(plugin):
     ("kind", "reason"),
     [
         ("broken", "the weights are on holiday"),
-        ("missing", "kind 'missing': cannot import toy_policies:none"),
+        ("missing", "policy kind 'missing' of the package toy-policies 1.0: cannot import toy_policies:none"),
         ("sinusiod", "unknown policy kind 'sinusiod': did you mean 'sinusoid'"),
     ],
 )

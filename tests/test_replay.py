@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from synthetic_log import clusters, make_row, write_log
 
-from osel_sim import replay, report
 from osel_sim.analysis.engine import Setup
 from osel_sim.analysis.engine import replay as replay_all
 from osel_sim.analysis.log import read_log
@@ -22,6 +21,8 @@ from osel_sim.analysis.measures import Curves, gap_closed
 from osel_sim.core.errors import DataError
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.formats.rollout_log import write_rollouts
+from osel_sim.replay import main as replay_main
+from osel_sim.report import main as report_main
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.statistics.intervals import RESAMPLES
 
@@ -35,7 +36,7 @@ def log(tmp_path_factory) -> Path:
 
 
 def run(*arguments: object) -> int:
-    return replay.main([str(argument) for argument in arguments])
+    return replay_main([str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +187,7 @@ def test_a_log_of_scores_counts_them_as_success_and_is_reported(tmp_path: Path):
     assert result["selectors"]["linucb"]["mean_score"] == pytest.approx(result["selectors"]["linucb"]["mean_reward"])
     for source in (tmp_path / "out", folder):
         page = tmp_path / f"page-{source.name}"
-        assert report.main([str(source), "--out", str(page), *(flags if source == folder else [])]) == 0
+        assert report_main([str(source), "--out", str(page), *(flags if source == folder else [])]) == 0
         assert not (page / "figures" / "frontier.png").exists()
         assert "neither times nor prices" in (page / "report.html").read_text()
     assert "mean_score" in (tmp_path / "page-out" / "tables" / "selectors.csv").read_text().splitlines()[0]

@@ -12,7 +12,7 @@ from osel_sim.cli.rollout_tables import print_rollouts, share_best
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.rollout_log import SCHEMA_VERSION, Row, read_rollouts, schema, write_rollouts
 from osel_sim.formats.shards import SHARDS, Shards
-from osel_sim.selection.reward import RewardWeights, logged_reward, preset, reward
+from osel_sim.selection.reward import RewardWeights, preset, reward, row_rewards
 
 COLUMNS = [
     "task",
@@ -205,14 +205,15 @@ def test_a_log_from_elsewhere_may_lack_columns(tmp_path, capsys):
 def test_reward_of_logged_rows_by_hand():
     oxe = preset("oxe")
     episode = row()
-    assert logged_reward(episode, oxe) == reward(episode.outcome, oxe)
-    assert logged_reward(replace(episode, error="died"), oxe) is None
     bare = row(score=-0.5, inference=2.0, upload=None, download=None, motion=None, subgoals=None, steps=None)
-    assert logged_reward(bare, replace(oxe, success="score")) == pytest.approx(-0.5 - 0.2 * np.log10(2.0) - 0.01 * 3.12)
-    assert logged_reward(bare, replace(oxe, success="subgoals")) is None
-    assert logged_reward(bare, preset("alfred")) is None
-    assert logged_reward(replace(bare, inference=None, price=None), oxe) is None
-    assert logged_reward(replace(bare, inference=None, price=None), RewardWeights(0.0, 0.0, success="score")) == -0.5
+    unknown = replace(bare, inference=None, price=None)
+    rows = [episode, replace(episode, error="died"), bare, unknown]
+    known = reward(episode.outcome, oxe)
+    assert row_rewards(rows, oxe) == pytest.approx([known, np.nan, 1 - 0.2 * np.log10(2.0) - 0.01 * 3.12, np.nan], abs=1e-12, nan_ok=True)
+    assert row_rewards([bare], replace(oxe, success="score")) == pytest.approx([-0.5 - 0.2 * np.log10(2.0) - 0.01 * 3.12])
+    assert np.isnan(row_rewards([bare], replace(oxe, success="subgoals"))).all()
+    assert np.isnan(row_rewards([bare], preset("alfred"))).all()
+    assert row_rewards([unknown], RewardWeights(0.0, 0.0, success="score")).tolist() == [-0.5]
     with pytest.raises(UsageError, match="has no score"):
         reward(episode.outcome, replace(oxe, success="score"))
 
@@ -264,3 +265,9 @@ def test_share_best_counts_complete_instances_only():
     rows = [row(0, "small", price=0.0), row(0, "large"), row(2, "small"), row(2, "large", price=0.0), row(4, "small", error="died"), row(4, "large")]
     assert share_best(rows, ["small", "large"], preset("oxe")) == {"small": 0.5, "large": 0.5}
     assert share_best(rows[4:], ["small", "large"], preset("oxe")) == {}
+
+
+def test_policies_that_come_to_the_same_share_an_instance_whatever_their_order():
+    rows = [row(0, "small", price=0.0), row(0, "large"), row(2, "small"), row(2, "large")]
+    for policies in (["small", "large"], ["large", "small"]):
+        assert share_best(rows, policies, preset("oxe")) == {"small": 0.75, "large": 0.25}

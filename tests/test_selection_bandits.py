@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from osel_sim.analysis.engine import replay_one
+from osel_sim.api.replay import choose_selectors
 from osel_sim.core.errors import UsageError
-from osel_sim.replay import choose_selectors
 from osel_sim.selection.registry import make_selector, setting_names
-from osel_sim.selection.thompson import probability_of_best
 
 POLICIES = ("a", "b", "c")
 
@@ -44,13 +43,6 @@ def test_ucb1_is_its_formula():
         counts[choice.policy] += 1
         sums[choice.policy] += rewards[choice.policy]
         selector.update(context, choice, rewards[choice.policy])
-
-
-def test_probability_of_best():
-    means, deviations = np.array([0.1, 0.0, 0.3]), np.array([0.2, 0.5, 0.01])
-    draws = np.random.default_rng(0).normal(means, deviations, size=(200_000, 3)).argmax(axis=1)
-    assert probability_of_best(means, deviations) == pytest.approx(np.bincount(draws) / len(draws), abs=0.005)
-    assert probability_of_best(np.zeros(4), np.ones(4)) == pytest.approx([0.25] * 4)
 
 
 @pytest.mark.parametrize("name", ["vw_squarecb", "vw_regcb", "ppo_tuned"])

@@ -8,7 +8,6 @@ import pytest
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.episodes.expected_costs import expected_costs
 from osel_sim.formats.policy_file import PolicySpec, Price, Remote
-from osel_sim.selection.bayesian import highest
 from osel_sim.selection.features import Components, Landmarks, Sketch
 from osel_sim.selection.kernel_ucb import KernelUCBSelector
 from osel_sim.selection.registry import make_selector
@@ -201,15 +200,6 @@ def test_wrong_settings(name, settings):
 
 def test_the_alias_is_the_same_selector():
     assert type(make_selector("auto", POLICIES, 4, 0)) is type(make_selector("kernel_ucb", POLICIES, 4, 0)) is KernelUCBSelector
-
-
-def test_probability_of_being_the_highest():
-    generator = np.random.default_rng(0)
-    means, deviations = np.array([0.1, 0.3, 0.25, -2.0]), np.array([0.3, 0.1, 0.2, 0.3])
-    draws = means + deviations * generator.normal(size=(200_000, 4))
-    frequencies = np.bincount(draws.argmax(axis=1), minlength=4) / len(draws)
-    assert highest(means, deviations) == pytest.approx(frequencies, abs=0.005)
-    assert highest(np.array([1.0, 1.0, 0.0]), np.zeros(3)).tolist() == [0.5, 0.5, 0.0]
 
 
 def test_features_keep_what_matters():

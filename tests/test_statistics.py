@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from osel_sim.core.errors import UsageError
+from osel_sim.statistics.best import best_of_each, gauss_hermite, probability_of_best, share_of_best
 from osel_sim.statistics.intervals import bootstrap_mean_interval, wilson_interval
 
 
@@ -50,3 +51,31 @@ def test_bootstrap_is_seeded_and_near_the_normal_interval():
 def test_bootstrap_needs_values(values):
     with pytest.raises(UsageError, match="finite"):
         bootstrap_mean_interval(values)
+
+
+@pytest.mark.parametrize(
+    ("quadrature", "means", "deviations"),
+    [
+        (None, [0.1, 0.0, 0.3], [0.2, 0.5, 0.002]),
+        (None, [0.1, 0.3, 0.25, -2.0], [0.3, 0.1, 0.2, 0.3]),
+        (gauss_hermite(), [0.1, 0.3, 0.25, -2.0], [0.3, 0.1, 0.2, 0.3]),
+    ],
+)
+def test_probability_of_best_is_the_frequency_among_draws(quadrature, means, deviations):
+    draws = np.random.default_rng(0).normal(means, deviations, size=(200_000, len(means))).argmax(axis=1)
+    found = probability_of_best(np.array(means), np.array(deviations), quadrature)
+    assert found == pytest.approx(np.bincount(draws, minlength=len(means)) / len(draws), abs=0.005)
+    assert found.sum() == pytest.approx(1.0)
+
+
+def test_probability_of_best_of_equals_and_of_what_is_certain():
+    assert probability_of_best(np.zeros(4), np.ones(4)) == pytest.approx([0.25] * 4)
+    assert probability_of_best(np.array([1.0, 1.0, 0.0]), np.zeros(3)).tolist() == [0.5, 0.5, 0.0]
+    assert probability_of_best(np.array([-3.0]), np.ones(1)).tolist() == [1.0]
+
+
+def test_equal_columns_share_a_row_and_rows_with_gaps_do_not_count():
+    table = np.array([[1.0, 0.3 - 0.1, 1.0], [0.0, 0.2, 0.1 + 0.1], [0.0, np.nan, 5.0], [3.0, 1.0, 2.0]])
+    assert share_of_best(table) == pytest.approx([1.5 / 3, 0.5 / 3, 1.0 / 3])
+    assert best_of_each(table).tolist() == [[True, False, True], [False, True, True], [False, False, False], [True, False, False]]
+    assert np.isnan(share_of_best(table[2:3])).all()

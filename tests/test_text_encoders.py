@@ -5,8 +5,8 @@ import importlib.util
 import numpy as np
 import pytest
 
-from osel_sim.context.encoder import load_encoder
-from osel_sim.context.text_encoders import TextOnly, TfidfEncoder, load_log_encoder
+from osel_sim.context.encoder import load_encoder, load_log_encoder
+from osel_sim.context.text_encoders import TextOnly, TfidfEncoder
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
 
 BODIES = ["the bone of the arm", "a bone in the hand", "blood and the heart", "the heart and its blood vessels", "bone and blood", "hand and arm"]

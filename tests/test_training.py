@@ -24,6 +24,7 @@ from osel_sim.train import main
 from osel_sim.training.batches import Batches, frames_of, statistics_of
 from osel_sim.training.dataset import load_demonstrations
 from osel_sim.training.instructions import Instructions
+from osel_sim.training.loop import Problem, Trainer
 from osel_sim.training.policy_training import Options, train
 from osel_sim.training.recipe import Augmentation, Recipe, find_recipe, load_recipe
 from osel_sim.training.source import Wanted
@@ -213,10 +214,50 @@ def test_a_resumed_run_ends_with_the_same_weights(tmp_path: Path, demonstrations
 
 def test_resume_refuses_another_seed(tmp_path: Path, demonstrations: Path) -> None:
     run(tmp_path, demonstrations, 4, until=2)
-    with pytest.raises(DataError, match="seed"):
+    with pytest.raises(CheckpointError, match="was trained with seed 0; give the same"):
         run(tmp_path, demonstrations, 4, resume=True, seed=1)
     with pytest.raises(UsageError, match="--resume"):
         run(tmp_path, demonstrations, 4)
+
+
+def test_a_state_that_is_a_pickle_damaged_or_of_another_model_is_refused(tmp_path: Path, demonstrations: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    torch.save({"step": 2}, out / "training_state.pt")
+    with pytest.raises(CheckpointError, match=r"training_state\.pt: is the state of an earlier version, a pickle, .* remove it to start over"):
+        run(out, demonstrations, 4, resume=True)
+    (out / "training_state.pt").unlink()
+    run(out, demonstrations, 4, until=2)
+    state = out / "training.state"
+    whole = state.read_bytes()
+    state.write_bytes(whole[:-10])
+    with pytest.raises(DataError, match="training state cannot be read"):
+        run(out, demonstrations, 4, resume=True)
+    state.write_bytes(whole.replace(b'"weights.', b'"wEights.'))
+    with pytest.raises(DataError, match="weights has other tensors than what is trained"):
+        run(out, demonstrations, 4, resume=True)
+    state.write_bytes(whole.replace(b'"optimiser.', b'"optimiser:'))
+    with pytest.raises(DataError, match="optimiser belongs to other parameters"):
+        run(out, demonstrations, 4, resume=True)
+
+
+def test_measuring_the_speed_changes_nothing_that_is_trained(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    module = torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.BatchNorm1d(4))
+    optimiser = torch.optim.AdamW(module.parameters(), lr=0.1)
+    problem = Problem(
+        module,
+        lambda step: torch.ones(2, 3),
+        lambda batch: (module(batch).sum(), {}),
+        optimiser,
+        lambda step, steps: 1.0,
+        tuple(module.parameters()),
+        0.0,
+    )
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    trainer = Trainer(problem, 5, "cpu", tmp_path, {})
+    assert trainer.steps_in(0.01) >= 1
+    assert all(torch.equal(value, before[name]) for name, value in module.state_dict().items()) and not optimiser.state
 
 
 @pytest.mark.slow
@@ -224,7 +265,7 @@ def test_a_killed_run_continues(tmp_path: Path, demonstrations: Path) -> None:
     command = [sys.executable, "-m", "osel_sim.train", "--policy", "local_small", "--data", str(demonstrations), "--out", str(tmp_path / "out")]
     command += ["--steps", "12", "--batch-size", "4", "--save-every", "1", "--eval-every", "12", "--threads", "1"]
     process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    while process.poll() is None and not (tmp_path / "out" / "training_state.pt").exists():
+    while process.poll() is None and not (tmp_path / "out" / "training.state").exists():
         time.sleep(0.05)
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -268,7 +309,7 @@ def test_wrong_use_is_one_line(tmp_path: Path, demonstrations: Path, capsys: pyt
     for arguments, words in {
         ("--policy", "local_smal", "--data", str(demonstrations)): "did you mean 'local_small'",
         ("--policy", "local_small", "--data", str(tmp_path / "none")): "osel_sim.collect",
-        ("--policy", "local_small", "--data", str(demonstrations), "--steps", "0"): "--steps must be at least 1",
+        ("--policy", "local_small", "--data", str(demonstrations), "--steps", "0"): "--steps: must be 1 or more, got 0",
         ("--policy", "local_small"): "--data",
         ("--policy", "local_small", "--data", str(demonstrations), "--step", "3"): "did you mean '--steps'?",
         ("--encoder", "osel_small"): "--data",

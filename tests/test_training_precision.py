@@ -8,8 +8,7 @@ from torch import Tensor, nn
 from torch.profiler import ProfilerActivity, profile
 
 from osel_sim.core.torch_settings import computes_bfloat16
-from osel_sim.training.loop import Trainer
-from osel_sim.training.recipe import Optimisation
+from osel_sim.training.loop import Problem, Trainer, warm_up_then_cosine
 
 
 class Convolution(nn.Module):
@@ -29,7 +28,9 @@ class Convolution(nn.Module):
 def test_no_step_falls_back_on_the_slow_convolution(tmp_path: Path) -> None:
     model = Convolution()
     images = torch.rand(4, 3, 32, 32, generator=torch.Generator().manual_seed(0))
-    trainer = Trainer(model, lambda step: {"image": images}, Optimisation(steps=2, batch_size=4, learning_rate=1e-3), "cpu", tmp_path, "fingerprint")
+    optimiser = torch.optim.AdamW(model.parameters(), lr=1e-3)
+    problem = Problem(model, lambda step: {"image": images}, model, optimiser, warm_up_then_cosine(1), tuple(model.parameters()), 1.0)
+    trainer = Trainer(problem, 2, "cpu", tmp_path, {"seed": 0})
     with profile(activities=[ProfilerActivity.CPU], acc_events=True) as profiled:
         trainer.run({}, save_every=2, label="convolution")
     ran = {event.key for event in profiled.key_averages()}

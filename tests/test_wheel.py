@@ -74,5 +74,5 @@ def test_every_command_helps_from_any_folder(command: str, installed: Path, tmp_
 
 
 def test_checkpoints_and_objects_are_those_of_the_wheel(installed: Path, tmp_path: Path) -> None:
-    code = "from osel_sim import content; print(content.resolve_checkpoint('assets/objects'))"
+    code = "from osel_sim.core import content; print(content.resolve_checkpoint('assets/objects'))"
     assert Path(run(installed, tmp_path, "-c", code).strip()) == installed / "osel_sim" / "content" / "assets" / "objects"

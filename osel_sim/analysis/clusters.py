@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.analysis.cross_fit import Rows, best_of_group, cross_fit
 from osel_sim.analysis.estimate import Estimate, mean_of
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.outcomes import OutcomeRates, rates_of
 from osel_sim.core.errors import DataError
-from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
+from osel_sim.selection.reward import RewardWeights, counted_time
 
 MOST_CLUSTERS = 40
 FEWEST_MEMBERS = 8  # a cluster of fewer on average says nothing about its policies
@@ -121,7 +122,7 @@ def describe(log: LoggedOutcomes, clustering: Clustering, weights: RewardWeights
 
     Only instances on which every policy has an outcome count: the means of a cluster's policies are then over the same instances.
     """
-    rewards, complete = log.mean_rewards(weights), complete_instances(log, weights)
+    rewards, complete = log.mean_rewards(weights), complete_rows(log, weights)
     clusters = []
     for number in range(clustering.count):
         rows = (clustering.labels == number) & complete
@@ -153,7 +154,7 @@ def inequality(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWe
     Args:
         labels: (N,) cluster of each instance.
     """
-    complete = complete_instances(log, weights)
+    complete = complete_rows(log, weights)
     rewards, own = log.mean_rewards(weights)[complete], labels[complete]
     by_cluster = [(float((own == number).mean()), rewards[own == number].mean(axis=0).max()) for number in np.unique(own)]
     part = log.take(complete)
@@ -179,7 +180,7 @@ def paper_sides(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[np.
     return 1.0 - only_remote, only_remote - float(merged.mean())
 
 
-def complete_instances(log: LoggedOutcomes, weights: RewardWeights) -> NDArray[np.bool_]:
+def complete_rows(log: LoggedOutcomes, weights: RewardWeights) -> NDArray[np.bool_]:
     """Which instances (N,) have a reward of every policy.
 
     Raises:
@@ -200,14 +201,11 @@ def _held_out(rewards: Array, labels: NDArray[np.int64], first: NDArray[np.bool_
     """Mean over all instances of (policy its cluster would take) - (policy all would take), each chosen on the half the instance is not in."""
     if first.all() or not first.any():
         return None
-    differences = np.empty(len(rewards))
-    for choosing in (first, ~first):
-        overall = int(rewards[choosing].mean(axis=0).argmax())
-        for number in np.unique(labels):
-            known, scored = choosing & (labels == number), ~choosing & (labels == number)
-            choice = int(rewards[known].mean(axis=0).argmax()) if known.any() else overall
-            differences[scored] = rewards[scored, choice] - rewards[scored, overall]
-    return mean_of(differences)
+
+    def difference(by: Rows, on: Rows) -> Array:
+        return np.asarray(rewards[on, best_of_group(rewards, labels, by, on)] - rewards[on, rewards[by].mean(axis=0).argmax()], np.float64)
+
+    return mean_of(cross_fit(first, difference))
 
 
 def _about(log: LoggedOutcomes, rows: NDArray[np.bool_]) -> str:
@@ -235,5 +233,5 @@ def score_of(log: LoggedOutcomes, weights: RewardWeights) -> Array:
 
 def time_of(log: LoggedOutcomes, weights: RewardWeights) -> Array:
     """The time the reward counts, (N, P), mean over the repeats: steps, or log10 of the seconds; 0 where the log has none."""
-    values = log.steps if weights.time_unit == "steps" else np.log10(np.maximum(log.seconds, FLOOR_SECONDS))
+    values = counted_time(weights, log.steps, log.seconds)
     return mean_over_repeats(values if np.isfinite(values).any() else np.zeros_like(values))

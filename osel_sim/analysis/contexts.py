@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.log import Array, LoggedOutcomes
 from osel_sim.selection.reward import RewardWeights
+from osel_sim.statistics.best import best_of_each
 
 MOST_POINTS = 1_200
-_TIE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ def lay_out(log: LoggedOutcomes, weights: RewardWeights, seed: int = 0, most: in
     places = TSNE(perplexity=min(30.0, len(rows) / 4), init="pca", random_state=seed).fit_transform(part.contexts)
     aspects = {
         "task": part.labels("task"),
+        "robot": part.labels("robot"),
         "object": part.labels("target"),
         "container": part.labels("container"),
         "phrasing": tuple(wording(label) for label in part.labels("phrasing")),
@@ -48,15 +49,11 @@ def lay_out(log: LoggedOutcomes, weights: RewardWeights, seed: int = 0, most: in
 
 def best_policies(log: LoggedOutcomes, weights: RewardWeights) -> tuple[str, ...]:
     """The policy with the highest mean reward on each instance, `several` where it is shared, `unknown` where one has no outcome."""
-    rewards = log.mean_rewards(weights)
-    best = []
-    for row in rewards:
-        if not np.isfinite(row).all():
-            best.append("unknown")
-            continue
-        top = np.flatnonzero(row >= row.max() - _TIE)
-        best.append(log.policies[top[0]] if len(top) == 1 else "several")
-    return tuple(best)
+    found = []
+    for best in best_of_each(log.mean_rewards(weights)):
+        columns = np.flatnonzero(best)
+        found.append(log.policies[columns[0]] if len(columns) == 1 else "several" if len(columns) else "unknown")
+    return tuple(found)
 
 
 def wording(phrasing: str) -> str:

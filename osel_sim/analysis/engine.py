@@ -1,12 +1,10 @@
 """Replays of selectors over streams of a log, in processes; the result does not depend on how many."""
 
-import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
+from functools import partial
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -14,11 +12,15 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.streams import Streams, draw_streams
-from osel_sim.analysis.warm_start import Beforehand, show
-from osel_sim.core.errors import OselError, UsageError
-from osel_sim.core.processes import end_with_parent
+from osel_sim.analysis.warm_start import WarmStart, show
+from osel_sim.core.errors import UsageError, WorkerError
+from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
+from osel_sim.interface.selector import Selector
 from osel_sim.selection.reward import RewardWeights
+
+Factory = Callable[[Sequence[str], int, int], Selector]
+"""Makes a selector of the policies' names, the length of a context and a seed."""
 
 WARM = ":warm"
 """Ending of the name of a selector that is shown all outcomes of other instances before its stream begins."""
@@ -34,12 +36,12 @@ class Setup:
     Attributes:
         weights: of the reward.
         settings: selector -> keyword arguments, where they are not to be the defaults.
-        beforehand: of other instances than the log's; needed for selectors named `NAME:warm`.
+        warm_start: of other instances than the log's; needed for selectors named `NAME:warm`.
     """
 
     weights: RewardWeights
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    beforehand: Beforehand | None = None
+    warm_start: WarmStart | None = None
 
 
 @dataclass(frozen=True)
@@ -66,29 +68,34 @@ def replay(
     decisions: int | None = None,
     workers: int = 1,
     progress: Callable[[int], Any] | None = None,
+    factories: Mapping[str, Factory] | None = None,
 ) -> list[Choices]:
     """Show the streams of all seeds to every selector, under each setup.
 
     Args:
         log: complete instances only (`osel_sim.analysis.streams.complete_instances`).
-        selectors: names, as `osel_sim.selection.registry.make_selector` takes them; `NAME:warm` for one that is shown what is known `beforehand`.
+        selectors: names, as `osel_sim.selection.registry.make_selector` takes them; `NAME:warm` for one that is shown the `warm_start` first.
         seeds: of the streams, and of the selectors.
         decisions: length of a stream; None: all instances.
         workers: processes; with 1 it happens in this one.
         progress: called with a number of decisions made.
+        factories: selector -> what makes it, where it is none of the registry's; these are replayed in this process, since a class of a notebook
+            cannot be imported by another.
 
     Raises:
         UsageError: a selector is to start warm and there is nothing to show it.
     """
     warm = [name for name in selectors if name.endswith(WARM)]
-    if warm and any(setup.beforehand is None for setup in setups):
-        raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to show beforehand")
+    if warm and any(setup.warm_start is None for setup in setups):
+        raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to start warm with")
     tables = tuple(log.rewards(setup.weights) for setup in setups)
     streams = tuple(draw_streams(table, seeds, decisions) for table in tables)
     material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams)
     jobs = [(at, name, number) for name in sorted(selectors, key=_slowness) for at in range(len(setups)) for number in range(len(seeds))]
     chosen = [{name: np.zeros(own.order.shape, np.int8) for name in selectors} for own in streams]
-    for (at, name, number), columns in _run(material, jobs, workers):
+    made = factories or {}
+    elsewhere = [job for job in jobs if job[1] not in made]
+    for (at, name, number), columns in chain(_run_own(material, [job for job in jobs if job[1] in made], made), _run(material, elsewhere, workers)):
         chosen[at][name][number] = columns
         if progress is not None:
             progress(len(columns))
@@ -101,14 +108,16 @@ def replay_one(
     rewards: NDArray[np.float64],
     policies: Sequence[str],
     seed: int,
-    beforehand: Beforehand | None = None,
+    warm_start: WarmStart | None = None,
+    factory: Factory | None = None,
     **settings: Any,
 ) -> NDArray[np.int8]:
     """Show one stream to one selector, which sees the reward of its choices only.
 
     Args:
         contexts: (T, D). rewards: (T, P).
-        beforehand: shown first, in an order of the seed's.
+        warm_start: shown first, in an order of the seed's.
+        factory: makes the selector; None: the registry does.
         settings: of the selector.
 
     Returns:
@@ -118,9 +127,10 @@ def replay_one(
     from osel_sim.selection.ppo.sb3 import PPOSelector
     from osel_sim.selection.registry import make_selector
 
-    selector = make_selector(name, policies, contexts.shape[1], seed, **settings)
-    if beforehand is not None:
-        show(selector, beforehand, policies, seed)
+    size = contexts.shape[1]
+    selector = make_selector(name, policies, size, seed, **settings) if factory is None else factory(policies, size, seed)
+    if warm_start is not None:
+        show(selector, warm_start, policies, seed)
     if isinstance(selector, PPOSelector) and supports(selector):
         return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
     column = {policy: index for index, policy in enumerate(policies)}
@@ -136,53 +146,39 @@ def _slowness(name: str) -> int:
     return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
 
 
+def _run_own(material: _Material, jobs: Sequence[_Job], factories: Mapping[str, Factory]) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
+    with _one_thread():
+        for job in jobs:
+            yield _replay_job(material, job, factories[job[1]])
+
+
 def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
     if workers == 1:
         with _one_thread():
             for job in jobs:
                 yield _replay_job(material, job)
         return
-    context = multiprocessing.get_context("spawn")  # a forked torch or numba is a hang waiting to happen
-    with ProcessPoolExecutor(workers, context, _prepare, (material,)) as pool:
-        try:
-            for future in as_completed([pool.submit(_in_worker, job) for job in jobs]):
-                yield future.result()
-        except BrokenProcessPool:
-            raise OselError("a worker process of the replay died (out of memory?); try --workers 1") from None
-        except BaseException:
-            # Otherwise leaving the pool waits for the replays that are running.
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+    with closing(run_jobs(partial(_replayer, material), jobs, workers)) as events:
+        for event in events:
+            if isinstance(event, Lost):
+                raise event.error or WorkerError(f"a worker process of the replay died twice ({event.cause}; out of memory?); try --workers 1")
+            yield event.value
 
 
-_material: _Material | None = None
-
-
-def _prepare(material: _Material) -> None:
-    """Make a worker ready."""
-    global _material
-    end_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C: end without a word, the parent says what there is to say
+def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int8]]]:
+    """What a worker does."""
     _limit_threads()
-    _material = material
+    return lambda job, _: [_replay_job(material, job)]
 
 
-def _in_worker(job: _Job) -> tuple[_Job, NDArray[np.int8]]:
-    if _material is None:
-        raise OselError("a worker process of the replay was not prepared")
-    return _replay_job(_material, job)
-
-
-def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int8]]:
+def _replay_job(material: _Material, job: _Job, factory: Factory | None = None) -> tuple[_Job, NDArray[np.int8]]:
     at, name, number = job
     setup, streams = material.setups[at], material.streams[at]
     rewards = streams.rewards(material.rewards[at], number)
     contexts = material.contexts[streams.order[number]]
     contexts.flags.writeable = False
-    kind, shown = name.removesuffix(WARM), setup.beforehand if name.endswith(WARM) else None
-    return job, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, **setup.settings.get(name, {}))
+    kind, shown = name.removesuffix(WARM), setup.warm_start if name.endswith(WARM) else None
+    return job, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, factory, **setup.settings.get(name, {}))
 
 
 def _limit_threads() -> Any:

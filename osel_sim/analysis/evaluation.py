@@ -17,7 +17,8 @@ def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
     """What `off_policy.json` holds, and `replay.json` under `off_policy`.
 
     Returns:
-        run (folder, selector, decisions, errors, mean_reward, ci95), reward, policies, targets: name -> `osel_sim.analysis.off_policy.Estimate`.
+        run (folder, selector, decisions, errors, mean_reward, ci95), reward, policies, targets: name -> what an
+        `osel_sim.analysis.off_policy.OffPolicyEstimate` holds.
         The targets are `fixed:<policy>`, `random`, and `greedy`: the policy of the highest reward by a linear model of the decisions so far.
 
     Raises:

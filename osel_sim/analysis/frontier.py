@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.clusters import find_clusters, score_of
+from osel_sim.analysis.cross_fit import best_of_group, cross_fit
 from osel_sim.analysis.engine import Setup, replay
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.weights_map import Axis, limits, moved, swept
@@ -62,7 +63,7 @@ def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWei
     tables = {key: mean_over_repeats(table) for key, table in measured(part, weights).items()}
     choosers: dict[str, Chooser] = {"hindsight oracle": lambda rewards: rewards.argmax(axis=1)}
     if first.any() and not first.all():
-        choosers["best policy of each cluster"] = lambda rewards: _by_cluster(rewards, own, first)
+        choosers["best policy of each cluster"] = lambda rewards: cross_fit(first, lambda by, on: best_of_group(rewards, own, by, on))
     found = []
     for name, choose in choosers.items():
         columns = [choose(part.mean_rewards(moved(weights, sweep, float(value)))) for value in values]
@@ -130,16 +131,6 @@ def selector_frontiers(
             },
         }
     return found
-
-
-def _by_cluster(rewards: Array, labels: NDArray[np.int64], first: NDArray[np.bool_]) -> NDArray[np.int64]:
-    chosen = np.empty(len(rewards), np.int64)
-    for choosing in (first, ~first):
-        overall = int(rewards[choosing].mean(axis=0).argmax())
-        for number in np.unique(labels):
-            known = choosing & (labels == number)
-            chosen[~choosing & (labels == number)] = int(rewards[known].mean(axis=0).argmax()) if known.any() else overall
-    return chosen
 
 
 def _mean(values: Array) -> float:

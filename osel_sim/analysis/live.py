@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.log import Array, LoggedInstance, LoggedOutcomes, dense, read_contexts
+from osel_sim.analysis.log import Array, LoggedInstance, LoggedOutcomes, dense, named_robots, read_contexts
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, read_journal, read_lines
-from osel_sim.formats.levels import label
+from osel_sim.formats.levels import instance_key, label
 from osel_sim.formats.rollout_log import ROLLOUTS, Row
 from osel_sim.formats.run_config import RUN
 from osel_sim.interface.outcome import Outcome, Seconds
@@ -19,7 +19,7 @@ from osel_sim.selection.reward import RewardWeights
 
 JOURNAL, COUNTERFACTUAL = "episodes.jsonl", "counterfactual.jsonl"
 
-ABOUT = ("task", "seed", "level", "axes", "split", "instruction", "phrasing", "target", "container")
+ABOUT = ("task", "seed", "level", "axes", "split", "instruction", "phrasing", "target", "container", "robot")
 """What a decision says of its instance."""
 
 
@@ -70,7 +70,9 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     for decision in decisions:
         if decision.policy not in policies or not decision.propensities.get(decision.policy, 0.0) > 0.0:
             raise DataError(f"{folder / JOURNAL}, line {decision.index + 1}: {decision.policy!r} is no policy of the run, or has no propensity")
-    instances = tuple(LoggedInstance(_key(decision), **{name: getattr(decision, name) for name in ABOUT if name != "axes"}) for decision in decisions)
+    instances = named_robots(
+        LoggedInstance(_key(decision), **{name: getattr(decision, name) for name in ABOUT if name != "axes"}) for decision in decisions
+    )
     rows = [_row(decision, decision.policy, decision.outcome) for decision in decisions]
     for number, (data, _) in enumerate(read_lines(folder / COUNTERFACTUAL)):
         if number < len(decisions):
@@ -85,7 +87,7 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
 
 
 def _key(decision: Decision) -> str:
-    return f"{decision.task}/{decision.split}/{label(decision.level, decision.axes)}/{decision.seed}"
+    return instance_key(decision.task, decision.split, label(decision.level, decision.axes), decision.seed, decision.robot)
 
 
 def _others(data: dict[str, Any], folder: Path, number: int) -> list[tuple[str, Outcome]]:

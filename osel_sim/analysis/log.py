@@ -1,7 +1,7 @@
 """A rollout log as arrays: what every policy did on every instance, and the instances' contexts."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts
-from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
+from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.selection.reward import RewardWeights, combined, counted_time, total_seconds
 from osel_sim.selection.skills import Skills
 
 Array = NDArray[np.float64]
@@ -23,7 +24,11 @@ MEASURES = ("success", "subgoals", "score", "steps", "upload", "inference", "dow
 
 @dataclass(frozen=True)
 class LoggedInstance:
-    """What an instance was about; a log from elsewhere may lack all but key and task."""
+    """What an instance was about; a log from elsewhere may lack all but key and task.
+
+    Attributes:
+        robot: None where all of the log are the usual one's, or there is none.
+    """
 
     key: str
     task: str
@@ -34,6 +39,7 @@ class LoggedInstance:
     seed: int | None = None
     level: int | None = None
     split: str | None = None
+    robot: str | None = None
 
     @property
     def half(self) -> Half:
@@ -96,9 +102,7 @@ class LoggedOutcomes:
     @property
     def seconds(self) -> Array:
         """Seconds from instruction to end of each episode, (N, P, R), as `osel_sim.selection.reward.total_seconds`; NaN where unknown."""
-        parts = np.stack([self.upload, self.inference, self.download])
-        waiting = np.where(np.isfinite(parts).any(axis=0), np.nansum(parts, axis=0), np.nan)
-        return np.fmax(self.motion, waiting)
+        return total_seconds(self.upload, self.inference, self.download, self.motion)
 
     def rewards(self, weights: RewardWeights) -> Array:
         """Reward of every outcome, (N, P, R), as `osel_sim.selection.reward.reward`; NaN where there is no outcome.
@@ -107,21 +111,16 @@ class LoggedOutcomes:
             DataError: the log has outcomes, but lacks throughout what the weights ask for.
         """
         score: Array = getattr(self, weights.success)
-        # What has no weight is left out, so that a log need not have it.
-        if weights.alpha_time > 0.0:
-            time = self.steps if weights.time_unit == "steps" else np.log10(np.maximum(self.seconds, FLOOR_SECONDS))
-        else:
-            time = np.zeros_like(score)
-        price = self.price if weights.alpha_price > 0.0 else np.zeros_like(score)
+        time, price = counted_time(weights, self.steps, self.seconds), self.price
         ran = np.isfinite(self.success)
-        for name, values, remedy in (
-            (weights.success, score, "choose success instead"),
-            ("times" if weights.time_unit == "log10-seconds" else "steps", time, "give --alpha-time 0"),
-            ("prices", price, "give --alpha-price 0"),
+        for name, values, weight, remedy in (
+            (weights.success, score, 1.0, "choose success instead"),
+            ("times" if weights.time_unit == "log10-seconds" else "steps", time, weights.alpha_time, "give --alpha-time 0"),
+            ("prices", price, weights.alpha_price, "give --alpha-price 0"),
         ):
-            if ran.any() and not np.isfinite(values).any():
+            if weight > 0.0 and ran.any() and not np.isfinite(values).any():
                 raise DataError(f"{self.source}: the log has no {name}, which the reward needs: {remedy}")
-        return np.asarray(score - weights.alpha_time * time - weights.alpha_price * price, np.float64)
+        return combined(weights, score, time, price)
 
     def expected_costs(self, weights: RewardWeights) -> dict[str, float]:
         """What a policy is charged for time and price on average where it succeeds: reward = success - cost.
@@ -210,7 +209,17 @@ def read_log(folder: Path, encoder: str | None = None) -> LoggedOutcomes:
     identity, contexts = read_contexts(folder, tuple(instances), encoder or metadata.get("encoder"))
     arrays, errors = dense(folder, rows, tuple(instances), policies)
     skills = read_skills(folder, identity, metadata.get(DECLARED))
-    return LoggedOutcomes(folder, tuple(instances.values()), policies, contexts, identity, **arrays, errors=errors, metadata=metadata, skills=skills)
+    return LoggedOutcomes(
+        folder, named_robots(instances.values()), policies, contexts, identity, **arrays, errors=errors, metadata=metadata, skills=skills
+    )
+
+
+def named_robots(instances: Iterable[LoggedInstance]) -> tuple[LoggedInstance, ...]:
+    """The instances, the usual robot named as well where there is another one."""
+    found = tuple(instances)
+    if not any(instance.robot for instance in found):
+        return found
+    return tuple(replace(instance, robot=instance.robot or DEFAULT_ROBOT) for instance in found)
 
 
 def read_contexts(folder: Path, instances: Sequence[str], encoder: str | None) -> tuple[str, NDArray[np.float32]]:
@@ -293,4 +302,4 @@ def dense(source: Path, rows: Sequence[Row], instances: Sequence[str], policies:
 
 
 def _instance(row: Row) -> LoggedInstance:
-    return LoggedInstance(row.instance, row.task, row.instruction, row.phrasing, row.target, row.container, row.seed, row.level, row.split)
+    return LoggedInstance(row.instance, row.task, row.instruction, row.phrasing, row.target, row.container, row.seed, row.level, row.split, row.robot)

@@ -77,7 +77,7 @@ def units(values: Array) -> Array:
     return np.asarray(values.mean(axis=1) if len(values) > 1 else values[0], np.float64)
 
 
-def measure(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -> dict[str, Any]:
+def measure_selector(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -> dict[str, Any]:
     """One selector: what `replay.json` says about it under `selectors`."""
     received = rewards.selectors[name]
     of_each = {"success": log.success, "subgoals": log.subgoals, "score": log.score, "steps": log.steps, "seconds": log.seconds, "price": log.price}

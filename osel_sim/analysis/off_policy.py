@@ -25,7 +25,7 @@ REFITS = 25
 
 
 @dataclass(frozen=True)
-class Estimate:
+class OffPolicyEstimate:
     """A target's mean reward a decision, three ways, each with its 95 % interval.
 
     Attributes:
@@ -47,7 +47,7 @@ class Estimate:
     unsupported: float
 
 
-def estimate(rewards: ArrayLike, chosen: ArrayLike, propensities: ArrayLike, target: ArrayLike, model: ArrayLike | None = None) -> Estimate:
+def estimate(rewards: ArrayLike, chosen: ArrayLike, propensities: ArrayLike, target: ArrayLike, model: ArrayLike | None = None) -> OffPolicyEstimate:
     """Estimate a target's mean reward.
 
     The run may have learned while it ran. For ips and dr each decision's term then still has, given all before it, the target's reward as its
@@ -78,13 +78,13 @@ def estimate(rewards: ArrayLike, chosen: ArrayLike, propensities: ArrayLike, tar
     squares = float((weights**2).sum())
     effective = float(weights.sum()) ** 2 / squares if squares > 0.0 else 0.0
     if unsupported > 0.0 or effective == 0.0:
-        return Estimate(None, None, None, None, None, None, effective, unsupported)
+        return OffPolicyEstimate(None, None, None, None, None, None, effective, unsupported)
     snips = float((weights * received).sum() / weights.sum())
     dr_terms = (wanted * predicted).sum(axis=1) + weights * (received - predicted[rows, columns])
     ips, ips_interval = _mean(weights * received)
     dr, dr_interval = _mean(dr_terms)
     _, (low, high) = _mean(weights * (received - snips) / weights.mean())
-    return Estimate(ips, ips_interval, snips, (snips + low, snips + high), dr, dr_interval, effective, unsupported)
+    return OffPolicyEstimate(ips, ips_interval, snips, (snips + low, snips + high), dr, dr_interval, effective, unsupported)
 
 
 def forward_model(contexts: NDArray[np.float32], rewards: Array, chosen: NDArray[np.int64], policies: int) -> Array:

@@ -11,11 +11,12 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.analysis.cross_fit import Rows, best_of_group, cross_fit
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
 
-GROUPINGS = ("task", "target", "container", "phrasing")
+GROUPINGS = ("task", "target", "container", "phrasing", "robot")
 """Attributes of an instance that the predictable oracle may know."""
 
 SHRINK = 4.0
@@ -108,18 +109,18 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
     candidates = [names for size in range(len(varying) + 1) for names in combinations(varying, size)]
     groups = {names: _groups([labels[name] for name in names], len(log)) for names in candidates}
     half, quarter = (np.array([bool(hashlib.sha256(key.encode()).digest()[byte] & 1) for key in log.keys], bool) for byte in (1, 2))
-    value, used = np.full(len(log), np.nan), {}
-    for name, scored in (("first", ~half), ("second", half)):
-        choosing = ~scored
+    used: list[tuple[str, ...]] = []
 
-        def held_out(names: tuple[str, ...], choosing: NDArray[np.bool_] = choosing) -> float:
-            parts = ((choosing & quarter, choosing & ~quarter), (choosing & ~quarter, choosing & quarter))
-            return sum(float(_choose(means, groups[names], by, on).sum()) for by, on in parts)
+    def decide(by: Rows, on: Rows) -> Array:
+        def held_out(names: tuple[str, ...]) -> float:
+            own, labels = means[by], groups[names][by]
+            return float(cross_fit(quarter[by], lambda inner, outer: _choose(own, labels, inner, outer)).sum())
 
         best = max(candidates, key=held_out)  # the first, thus the coarsest, where several are equal
-        value[scored] = _choose(means, groups[best], choosing, scored)
-        used[name] = best
-    return value, used
+        used.append(best)
+        return _choose(means, groups[best], by, on)
+
+    return cross_fit(~half, decide), dict(zip(("first", "second"), used, strict=True))
 
 
 def per_task(log: LoggedOutcomes, means: Array) -> NDArray[np.int64]:
@@ -129,15 +130,11 @@ def per_task(log: LoggedOutcomes, means: Array) -> NDArray[np.int64]:
     return best[groups]
 
 
-def _choose(means: Array, groups: NDArray[np.int64], by: NDArray[np.bool_], on: NDArray[np.bool_]) -> Array:
+def _choose(means: Array, groups: NDArray[np.int64], by: Rows, on: Rows) -> Array:
     """Rewards on the instances `on` of the policy best in their group among the instances `by`."""
     if not by.any() or not on.any():
         return means[on].mean(axis=1)
-    overall = means[by].mean(axis=0)
-    counts = np.bincount(groups[by], minlength=groups.max() + 1)
-    sums = np.stack([np.bincount(groups[by], weights=means[by, column], minlength=groups.max() + 1) for column in range(means.shape[1])], axis=1)
-    shrunk = (sums + SHRINK * overall) / (counts[:, None] + SHRINK)
-    return np.asarray(means[on, shrunk.argmax(axis=1)[groups[on]]], np.float64)
+    return np.asarray(means[on, best_of_group(means, groups, by, on, SHRINK)], np.float64)
 
 
 def _groups(labels: Sequence[Sequence[str]], count: int) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from osel_sim.analysis.log import LoggedOutcomes
-from osel_sim.analysis.measures import curves, measure, paired
+from osel_sim.analysis.measures import curves, measure_selector, paired
 from osel_sim.analysis.oracles import Oracles
 from osel_sim.analysis.streams import LeftOut
 from osel_sim.analysis.verdict import reward_span, verdict
@@ -46,7 +46,7 @@ def build(
     rewards = curves(log, weights, choices, best)
     policies = choices.policies
     singles = {BEST: policies[best.best_single], WORST: policies[best.worst_single]}
-    selectors = {name: {**kind(name, singles), **measure(log, choices, rewards, name)} for name in choices.chosen}
+    selectors = {name: {**kind(name, singles), **measure_selector(log, choices, rewards, name)} for name in choices.chosen}
     learners = [name for name, entry in selectors.items() if entry["kind"] == "learner"]
     return {
         "log": {

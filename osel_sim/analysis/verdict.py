@@ -62,7 +62,7 @@ def verdict(rewards: Curves, learners: Sequence[str], measured: Mapping[str, Map
 
     Args:
         learners: selectors that may be advised.
-        measured: selector -> what was measured of it (`osel_sim.analysis.measures.measure`); `fixed:<policy>` among them.
+        measured: selector -> what was measured of it (`osel_sim.analysis.measures.measure_selector`); `fixed:<policy>` among them.
         policy: the best single policy.
         span: rewards lie within an interval of this length.
 

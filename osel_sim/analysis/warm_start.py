@@ -15,7 +15,7 @@ _SALT = 0x3A2E
 
 
 @dataclass(frozen=True)
-class Beforehand:
+class WarmStart:
     """Outcomes of instances that are not decided on: contexts float32 (M, D), rewards (M, P, R), NaN where there is none."""
 
     contexts: NDArray[np.float32]
@@ -34,14 +34,14 @@ def check_can_start_warm(name: str) -> None:
         raise UsageError(f"selector {kind!r} learns only from what it chose itself, so it cannot start warm; those that can: {', '.join(able)}")
 
 
-def show(selector: Selector, beforehand: Beforehand, policies: Sequence[str], seed: int) -> int:
+def show(selector: Selector, warm_start: WarmStart, policies: Sequence[str], seed: int) -> int:
     """Let a selector learn from every outcome, in an order of the seed's, as if each had been chosen by chance. Returns how many there were.
 
     Args:
         policies: P names, in the order of the rewards.
     """
     chances = {policy: 1.0 / len(policies) for policy in policies}
-    known = np.argwhere(np.isfinite(beforehand.rewards))
+    known = np.argwhere(np.isfinite(warm_start.rewards))
     for row, column, repeat in np.random.default_rng([_SALT, seed]).permutation(known):
-        selector.update(beforehand.contexts[row], Choice(policies[column], chances), float(beforehand.rewards[row, column, repeat]))
+        selector.update(warm_start.contexts[row], Choice(policies[column], chances), float(warm_start.rewards[row, column, repeat]))
     return len(known)

@@ -8,11 +8,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.clusters import complete_instances, score_of, time_of
+from osel_sim.analysis.clusters import complete_rows, score_of, time_of
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.outcomes import rates_of
 from osel_sim.core.errors import DataError
-from osel_sim.selection.reward import RewardWeights
+from osel_sim.selection.reward import RewardWeights, charge, combined
 
 Axis = Literal["alpha_time", "alpha_price"]
 AXES: tuple[Axis, Axis] = ("alpha_time", "alpha_price")
@@ -79,11 +79,11 @@ def swept(log: LoggedOutcomes, weights: RewardWeights) -> Swept:
     Raises:
         DataError: no instance has an outcome of every policy at the weights given.
     """
-    rows = complete_instances(log, weights)
+    rows = complete_rows(log, weights)
     axes: list[Axis] = []
     for axis in AXES:
         try:
-            also = rows & complete_instances(log, moved(weights, axis, 1.0))
+            also = rows & complete_rows(log, moved(weights, axis, 1.0))
         except DataError:
             continue
         if also.any():
@@ -112,7 +112,7 @@ class _Means:
         return float(self.shares @ rewards.max(axis=1) - (self.shares @ rewards).max())
 
     def _rewards(self, alpha_time: float, alpha_price: float) -> Array:
-        return np.asarray(self.score - alpha_time * self.time - alpha_price * self.price, np.float64)
+        return combined(RewardWeights(alpha_time, alpha_price), self.score, self.time, self.price)
 
 
 def weights_map(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWeights, remote: NDArray[np.bool_]) -> WeightsMap | None:
@@ -185,7 +185,7 @@ class _Paper:
 
     def remote_best(self, weights: RewardWeights) -> NDArray[np.bool_]:
         """Which clusters (C,) the paper gives to the remote side; of several remote policies the one with the highest reward on each instance."""
-        penalties = weights.alpha_time * self._time + weights.alpha_price * self._price
+        penalties = charge(weights, self._time, self._price)
         merged = np.take_along_axis(penalties, (self._score - penalties).argmax(axis=1)[:, None], axis=1)[:, 0]
         return np.array([1.0 - rate < rate - merged[rows].mean() for rate, rows in zip(self._only_remote, self._members, strict=True)])
 

@@ -1,15 +1,28 @@
 """Tables on the terminal."""
 
 import sys
+from collections.abc import Iterable
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Table
+
+from osel_sim.core.shown import shown
+
+
+class SafeConsole(Console):
+    """A console on which only rich's own control codes reach the terminal, and none that stands in a text."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """The segments of anything, their texts as they may be shown."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(shown(segment.text), segment.style)
 
 
 def console() -> Console:
     """Standard output; wide enough for a table where it is no terminal."""
-    return Console(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False)
+    return SafeConsole(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False)
 
 
 def number(value: float | None, digits: int = 2) -> str:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim.core import content
+from osel_sim.core.shown import all_shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 
@@ -63,4 +64,5 @@ def _task(task: TaskSpec) -> dict[str, Any]:
 
 def _policy(policy: PolicySpec) -> dict[str, Any]:
     location = "remote" if policy.is_remote else "local"
-    return {**asdict(policy), "location": location, "privileged": policy.is_privileged, "file": str(policy.file)}
+    found: dict[str, Any] = all_shown(asdict(policy))  # without the login and query of an address
+    return {**found, "location": location, "privileged": policy.is_privileged, "file": str(policy.file)}

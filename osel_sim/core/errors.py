@@ -1,13 +1,23 @@
 """Typed errors. Every one of them is the user's to read: commands print its message as one line and exit with `exit_code`."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from osel_sim.core.shown import shown
 
 
 class OselError(Exception):
-    """Base of all errors this package raises on purpose."""
+    """Base of all errors this package raises on purpose. Its text may quote what others wrote, and holds neither control characters nor secrets."""
 
     exit_code = 2
+
+    def __reduce__(self) -> tuple[Callable[..., "OselError"], tuple[Any, ...]]:
+        # By default an exception is made again from its message alone, which those with arguments of their own do not take.
+        return _restore, (type(self), self.args, self.__dict__)
+
+    def __str__(self) -> str:
+        return shown(super().__str__())
 
 
 class UsageError(OselError):
@@ -50,7 +60,40 @@ class DataError(OselError):
     """A journal, rollout log or dataset cannot be read or does not have the promised form."""
 
 
+class WorkerError(OselError):
+    """Worker processes keep dying, so the work cannot go on. The message names how the last one ended."""
+
+
+class SettingError(UsageError):
+    """A setting of a command has a value it cannot work with. The command line shows the setting as a flag.
+
+    Attributes:
+        setting: name of the setting.
+        problem: what is wrong with its value.
+    """
+
+    def __init__(self, setting: str, problem: str) -> None:
+        super().__init__(f"{setting}: {problem}" if setting else problem)
+        self.setting, self.problem = setting, problem
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """`did you mean 'x'? `, or nothing where nothing is near."""
-    near = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    near = nearest(name, known)
     return f"did you mean {near[0]!r}? " if near else ""
+
+
+def nearest(name: str, known: Iterable[str], count: int = 1, cutoff: float = 0.5) -> list[str]:
+    """The known names most like `name`, the best first.
+
+    Args:
+        count: at most so many.
+        cutoff: least likeness, in [0, 1]; 0 takes the nearest however far it is.
+    """
+    return difflib.get_close_matches(name, list(known), n=count, cutoff=cutoff)
+
+
+def _restore(kind: type[OselError], arguments: tuple[Any, ...], state: dict[str, Any]) -> OselError:
+    error = kind.__new__(kind, *arguments)
+    error.__dict__.update(state)
+    return error

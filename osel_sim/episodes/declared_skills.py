@@ -1,13 +1,13 @@
 """The skills that policies declare, and what instructions that ask for them look like to an encoder."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from osel_sim.core import content
-from osel_sim.core.errors import ContentError, UnknownNameError
+from osel_sim.core.errors import ContentError, DataError, UnknownNameError
+from osel_sim.core.files import read_json
 from osel_sim.core.torch_settings import threads
 from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
@@ -42,8 +42,8 @@ def declared_skills(spec: PolicySpec, tasks: Path | None = None) -> tuple[str, .
     if not isinstance(checkpoint, Path):
         return None
     try:
-        trained = [dataset["task"] for dataset in json.loads((checkpoint / TRAINING).read_bytes())["datasets"]]
-    except (OSError, ValueError, KeyError, TypeError):
+        trained = [dataset["task"] for dataset in read_json(checkpoint / TRAINING)["datasets"]]
+    except (DataError, KeyError, TypeError):
         return None
     known = content.files("tasks", tasks)
     return tuple(dict.fromkeys(name for name in trained if isinstance(name, str) and name in known)) or None

@@ -1,6 +1,6 @@
 """Policies made ready to drive: local ones loaded, servers of remote ones started, fallbacks found."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Self
@@ -10,10 +10,14 @@ from osel_sim.core.errors import ContentError, OselError, UsageError
 from osel_sim.episodes.loop import Driver
 from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.policy.objects import PolicyObject
 
 
-def choose_policies(names: Sequence[str] | None, folder: Path | None = None) -> list[PolicySpec]:
+def choose_policies(names: Sequence[str] | None, folder: Path | None = None, objects: Mapping[str, PolicyObject] | None = None) -> list[PolicySpec]:
     """Policy files by name, or all there are that see no more than a robot could.
+
+    Args:
+        objects: policies that no file describes, by name.
 
     Raises:
         UnknownNameError: no such policy.
@@ -29,7 +33,8 @@ def choose_policies(names: Sequence[str] | None, folder: Path | None = None) -> 
     for name in wanted:
         if wanted.count(name) > 1:
             raise UsageError(f"policy {name!r} is named twice after --policies")
-    return [library.load_policy(name, folder) for name in wanted]
+    at_hand = objects or {}
+    return [at_hand[name].spec if name in at_hand else library.load_policy(name, folder) for name in wanted]
 
 
 def with_fallbacks(specs: Sequence[PolicySpec], folder: Path | None = None) -> list[PolicySpec]:
@@ -58,13 +63,14 @@ class Drivers:
 
     Args:
         specs: the policies and their fallbacks (`with_fallbacks`).
+        objects: those of them that no file describes, by name.
 
     Raises:
         CheckpointError: a policy cannot be loaded.
         RemoteError: a server cannot be started or reached.
     """
 
-    def __init__(self, specs: Sequence[PolicySpec]) -> None:
+    def __init__(self, specs: Sequence[PolicySpec], objects: Mapping[str, PolicyObject] | None = None) -> None:
         from osel_sim.policy.local import LocalCaller
         from osel_sim.policy.registry import make_policy
         from osel_sim.remote.policy import open_remote
@@ -79,7 +85,9 @@ class Drivers:
             try:
                 for spec in specs:
                     if not spec.is_remote:
-                        caller = ExpertCaller(spec) if spec.is_privileged else LocalCaller(make_policy(spec), spec)
+                        at_hand = (objects or {}).get(spec.name)
+                        policy = None if spec.is_privileged else at_hand.policy if at_hand else make_policy(spec)
+                        caller = ExpertCaller(spec) if policy is None else LocalCaller(policy, spec)
                         self._drivers[spec.name] = Driver(spec, caller)
             except OselError as error:
                 problem = error

@@ -7,7 +7,7 @@ from osel_sim.core.errors import UsageError
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ
 from osel_sim.remote.network import NetworkModel, profile
-from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
+from osel_sim.selection.reward import RewardWeights, charge, counted_time
 
 DRAWS = 1000
 """Calls over which the delays of a network are averaged."""
@@ -36,8 +36,8 @@ def _cost(spec: PolicySpec, weights: RewardWeights, actions: int) -> float:
     calls = math.ceil(actions / spec.execute)
     waiting, megabytes = _call(spec)
     steps = actions + calls * waiting
-    time = steps if weights.time_unit == "steps" else math.log10(max(steps / CONTROL_HZ, FLOOR_SECONDS))
-    return weights.alpha_time * time + weights.alpha_price * spec.price.of(actions, calls, calls * megabytes)
+    time = counted_time(weights, steps, steps / CONTROL_HZ)
+    return float(charge(weights, time, spec.price.of(actions, calls, calls * megabytes)))
 
 
 def _call(spec: PolicySpec) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,6 @@ from osel_sim.interface.selector import Choice, Selector
 from osel_sim.selection.reward import RewardWeights, reward
 
 if TYPE_CHECKING:
-    from osel_sim.context.cache import ContextCache
     from osel_sim.interface.encoder import Encoder
     from osel_sim.sim.instance import Instance
     from osel_sim.sim.task_envs import TaskEnvs
@@ -70,13 +69,14 @@ class LiveRun:
         tasks: Sequence[TaskSpec],
         envs: "TaskEnvs",
         encoder: "Encoder",
-        cache: "ContextCache",
         drivers: Drivers,
         selector: Selector,
         weights: RewardWeights,
         options: LiveOptions,
     ) -> None:
-        self.folder, self.tasks, self.envs, self.encoder, self.cache = folder, tasks, envs, encoder, cache
+        from osel_sim.context.cache import ContextCache
+
+        self.folder, self.tasks, self.envs, self.encoder, self.cache = folder, tasks, envs, encoder, ContextCache(folder)
         self.drivers, self.selector, self.weights, self.options = drivers, selector, weights, options
         self._journal = Lines(folder / JOURNAL)
         self.decisions = [to_decision(data, index, self._journal.file) for index, (data, _) in enumerate(self._journal.rows)]
@@ -149,7 +149,7 @@ class LiveRun:
             }
         )
         # The journal comes last: what it does not have did not happen.
-        self._journal.append(asdict(decision))
+        self._journal.append(decision.to_dict())
         self.decisions.append(decision)
         self._remember(rewards)
         self._learn(context, choice, decision.reward)
@@ -221,5 +221,6 @@ class LiveRun:
             reward=self._reward(outcome),
             fallback=outcome.fallback,
             error=outcome.error,
+            robot=instance.other_robot,
             **own,
         )

@@ -1,6 +1,5 @@
 """One instance with one policy, looked at closely: what it saw, what it did, how it ended (`python -m osel_sim.doctor --policy FILE`)."""
 
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, override
@@ -10,9 +9,11 @@ from numpy.typing import NDArray
 
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
+from osel_sim.core.files import finite, write_json
 from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
 from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.call import Call, Caller, Privileged
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.policy import ACTION_DIM, Observation
@@ -116,27 +117,25 @@ def find_policy(policy: str, folder: Path | None) -> tuple[PolicySpec, Path | No
     return load_policy_file(file.resolve()), file.resolve().parent
 
 
-def check_policy(spec: PolicySpec, task: str, seed: int, level: int, out: Path, tasks: Path | None = None, policies: Path | None = None) -> Report:
+def check_policy(spec: PolicySpec, task: TaskSpec, seed: int, level: int, out: Path, policies: Path | None = None) -> Report:
     """Let a policy act on one test instance, without its fallback, and look at everything that went in and out.
 
     Args:
         out: folder for pictures and `report.json`.
-        tasks, policies: folders of the user's own files.
+        policies: folder of the user's own policy files.
 
     Raises:
         OselError: the policy does not load, its file is wrong, or its server cannot be reached.
     """
     from osel_sim.episodes.drivers import Drivers
-    from osel_sim.formats.task_file import load_task_file
     from osel_sim.sim.env import TaskEnv
     from osel_sim.sim.instance import make_instance
 
-    task_spec = load_task_file(content.find("tasks", task, tasks))
-    instance = make_instance(task_spec, seed, level, "test")
+    instance = make_instance(task, seed, level, "test")
     report = Report(spec.name, instance.key, instance.instruction)
     with Drivers([spec]) as drivers:
         watched = Watched(drivers[spec.name].caller)
-        env = TaskEnv(task_spec)
+        env = TaskEnv(task)
         try:
             env.load(instance)
             other = _OtherInstruction(drivers[spec.name])
@@ -151,9 +150,7 @@ def check_policy(spec: PolicySpec, task: str, seed: int, level: int, out: Path, 
         report.pictures = _pictures(spec, [observation for observation, _ in watched.seen], out)
     _actions(report, [call.actions for _, call in watched.seen if call.actions is not None], other.answer)
     _end(report, outcome)
-    partial = out / "report.json.partial"
-    partial.write_text(json.dumps(asdict(report), indent=2) + "\n")
-    partial.replace(out / "report.json")
+    write_json(out / "report.json", finite(asdict(report)))
     return report
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim.context.cache import ContextCache
-from osel_sim.episodes.workers import Episode, Plan, Recorded
+from osel_sim.episodes.workers import Episode, Plan, Recorded, worker_died
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts, write_rollouts
 from osel_sim.formats.shards import SHARDS, Shards
 from osel_sim.selection.skills import Skills
@@ -12,6 +12,8 @@ from osel_sim.selection.skills import Skills
 
 class Recording:
     """What a folder holds of a plan: in its rollout log and contexts if it has those already, and in the shards beside them.
+
+    Episodes that were lost because their worker died count as not there.
 
     Args:
         encoder: identity of the one whose contexts are wanted.
@@ -28,12 +30,16 @@ class Recording:
         self._rows: dict[str, dict[Episode, Row]] = {}
         there, metadata = read_rollouts(folder) if (folder / ROLLOUTS).exists() else ([], {})
         self._declared, self._default = metadata.get(DECLARED), metadata.get("encoder")
-        for row in there:
-            self._rows.setdefault(row.instance, {})[row.policy, row.repeat] = row
         self._shards = Shards(folder) if (folder / SHARDS).exists() else None
-        if self._shards is not None:
-            for instance, rows in self._shards.rows.items():
-                self._rows.setdefault(instance, {}).update(rows)
+        in_shards = [row for rows in self._shards.rows.values() for row in rows.values()] if self._shards is not None else []
+        for row in [*there, *in_shards]:
+            if not worker_died(row):
+                self._rows.setdefault(row.instance, {})[row.policy, row.repeat] = row
+
+    @property
+    def lost(self) -> list[Row]:
+        """Episodes that were lost, and lost again if they were there before, because their worker died."""
+        return [row for rows in self._rows.values() for row in rows.values() if worker_died(row)]
 
     @property
     def complete(self) -> bool:

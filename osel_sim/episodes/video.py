@@ -1,12 +1,14 @@
 """Videos: what the camera saw, with instruction, policy, step and price written into the frame."""
 
 import textwrap
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.files import atomic
 from osel_sim.episodes.loop import Frame, Subscriber
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.policy import CONTROL_HZ
@@ -32,7 +34,7 @@ class Video(Subscriber):
 
     def __init__(self, file: Path, camera: str = "agentview", quality: str = "full") -> None:
         self.file, self.camera, self.quality = file, camera, quality
-        self._partial = file.with_name(f".{file.name}.partial")
+        self._file = ExitStack()
         self._writer: Generator[None, NDArray[np.uint8] | None, None] | None = None
         self._last: Frame | None = None
         self._image: NDArray[np.uint8] = np.zeros((SIZE, SIZE, 3), np.uint8)
@@ -43,7 +45,7 @@ class Video(Subscriber):
 
         self.file.parent.mkdir(parents=True, exist_ok=True)
         self._writer = imageio_ffmpeg.write_frames(
-            str(self._partial),
+            str(self._file.enter_context(atomic(self.file))),
             (SIZE, SIZE + _BAND),
             fps=CONTROL_HZ / EVERY,
             codec="libx264",
@@ -70,7 +72,7 @@ class Video(Subscriber):
         for _ in range(HOLD_SECONDS * CONTROL_HZ // EVERY - 1):
             self._send(self._image)
         self._writer.close()
-        self._partial.replace(self.file)
+        self._file.close()
 
     def _show(self, frame: Frame, outcome: Outcome | None = None) -> None:
         self._last = frame

@@ -1,21 +1,17 @@
-"""Worker processes that record episodes: each has its own simulator, policies and servers, and may die without taking the others' work along.
+"""Recording episodes in worker processes: each has its own simulator, policies and servers, and may die without taking the others' work along.
 
-The parent hands out one instance at a time and gets its episodes back one by one. If a worker dies, the episode it was in becomes an error row, and a
-new worker does the rest of that instance.
+A worker gets one instance at a time and gives back its context, then one row an episode. An episode whose worker died is tried once more; if that
+worker dies as well, it becomes an error row, and a new worker does the rest of the instance.
 """
 
 import functools
-import multiprocessing
-import queue
-import signal
-import threading
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from osel_sim.core.errors import OselError
+from osel_sim.core.errors import WorkerError
+from osel_sim.core.processes import Result, Work, run_jobs
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.formats.task_file import TaskSpec
@@ -26,6 +22,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+WORKER_DIED = "the worker process died"
+"""How the error of an episode begins that was lost with its worker, which says nothing of the policy."""
 
 Episode = tuple[str, int]
 """Policy and repeat."""
@@ -80,118 +78,50 @@ class Recorded:
     context: "NDArray[np.float32] | None" = None
 
 
+@dataclass(frozen=True)
+class _Job:
+    """One instance. Its results are the context, then a row an episode."""
+
+    instance: str
+    episodes: tuple[Episode, ...]
+
+    def __str__(self) -> str:
+        return self.instance
+
+
 def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int) -> Iterator[Recorded | None]:
     """Record these episodes, by instance, each instance yielded when all of its are there, in no particular order; None for every episode in between.
 
     Every instance gets its context as well, also one without episodes.
 
     Raises:
-        OselError: a worker cannot start.
+        OselError: a policy or the encoder cannot be loaded.
+        WorkerError: workers keep dying.
     """
-    todo: queue.SimpleQueue[tuple[str, Sequence[Episode]]] = queue.SimpleQueue()
-    results: queue.SimpleQueue[Recorded | Exception | None] = queue.SimpleQueue()
-    for work in missing.items():
-        todo.put(work)
-    crew = [_Supervisor(plan, todo, results) for _ in range(min(workers, len(missing)))]
-    left = len(missing)
-    try:
-        for supervisor in crew:
-            supervisor.start()
-        while left:
-            result = results.get()
-            if isinstance(result, Exception):
-                raise result
-            left -= result is not None
-            yield result
-    finally:
-        for supervisor in crew:
-            supervisor.stop()
+    jobs = [_Job(instance, tuple(episodes)) for instance, episodes in missing.items()]
+    under_way = {job.instance: Recorded(job.instance) for job in jobs}
+    made, cause = 0, ""
+    with closing(run_jobs(functools.partial(_recorder, plan), jobs, workers, lambda job: 1 + len(job.episodes))) as events:
+        for event in events:
+            job, recorded = event.job, under_way[event.job.instance]
+            if event.index == 0:
+                recorded.context = event.value if isinstance(event, Result) else None
+            else:
+                policy, repeat = job.episodes[event.index - 1]
+                if isinstance(event, Result):
+                    recorded.rows[policy, repeat], made = event.value, made + 1
+                else:
+                    cause = event.cause
+                    recorded.rows[policy, repeat] = error_row(plan, job.instance, policy, repeat, f"{WORKER_DIED} ({cause})")
+                yield None
+            if event.index == len(job.episodes):
+                yield under_way.pop(job.instance)
+    if cause and not made:
+        raise WorkerError(f"no episode was recorded: {WORKER_DIED} every time ({cause})")
 
 
-class _Supervisor(threading.Thread):
-    """Hands instances to a worker process of its own, and starts another when that dies."""
-
-    def __init__(
-        self, plan: Plan, todo: "queue.SimpleQueue[tuple[str, Sequence[Episode]]]", results: "queue.SimpleQueue[Recorded | Exception | None]"
-    ) -> None:
-        super().__init__(daemon=True)
-        self._plan, self._todo, self._results = plan, todo, results
-        self._process: SpawnProcess | None = None
-        self._pipe: Connection | None = None
-        self._stopped = False
-
-    def run(self) -> None:
-        try:
-            while not self._stopped:
-                self._record(*self._todo.get_nowait())
-        except queue.Empty:
-            self.stop()
-        except Exception as error:
-            if not self._stopped:
-                self._results.put(error)
-
-    def stop(self) -> None:
-        """End the worker at once; its servers notice and end as well."""
-        self._stopped = True
-        if self._process is not None:
-            self._process.kill()
-
-    def _record(self, instance: str, episodes: Sequence[Episode]) -> None:
-        recorded, missing = Recorded(instance), list(episodes)
-        while True:
-            pipe = self._pipe or self._hire()
-            try:
-                pipe.send((instance, missing))
-                recorded.context = pipe.recv()
-                for episode in missing:
-                    recorded.rows[episode] = pipe.recv()
-                    self._results.put(None)
-                break
-            except (EOFError, OSError):
-                if self._stopped:
-                    return
-                died = self._dismiss()
-                missing = [episode for episode in episodes if episode not in recorded.rows]
-                if missing:
-                    policy, repeat = missing.pop(0)
-                    recorded.rows[policy, repeat] = error_row(self._plan, instance, policy, repeat, f"the worker process died ({died})")
-                    self._results.put(None)
-                if not missing:
-                    break
-        self._results.put(recorded)
-
-    def _hire(self) -> Connection:
-        """Start a worker and wait until it is ready.
-
-        Raises:
-            OselError: it cannot start.
-        """
-        context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_work, args=(self._plan, theirs), daemon=True)
-        self._process.start()
-        theirs.close()
-        try:
-            problem = self._pipe.recv()
-        except EOFError:
-            problem = f"a worker process died while it started ({self._dismiss()})"
-        if problem is not None:
-            raise OselError(problem)
-        return self._pipe
-
-    def _dismiss(self) -> str:
-        """How the dead worker ended."""
-        process, self._process, self._pipe = self._process, None, None
-        if process is None:
-            return "it was not there"
-        process.join()
-        code = process.exitcode or 0
-        return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-
-def _work(plan: Plan, pipe: Connection) -> None:
-    """A worker process: says that it is ready, then sends for every (instance, episodes) it gets the context and one row an episode."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
+def _recorder(plan: Plan) -> Work[_Job, Any]:
+    """What a worker does: load encoder, policies and servers, then instance by instance."""
     import torch
 
     from osel_sim.context.encoder import load_encoder
@@ -201,29 +131,27 @@ def _work(plan: Plan, pipe: Connection) -> None:
     from osel_sim.sim.task_envs import TaskEnvs
 
     torch.set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
-    try:
-        encoder = load_encoder(plan.encoder)
-        drivers = Drivers(plan.everyone)
-    except OselError as error:
-        pipe.send(str(error))
-        return
+    encoder, drivers = load_encoder(plan.encoder), Drivers(plan.everyone)
     envs = TaskEnvs(plan.tasks, keep=2)  # work comes task by task
-    pipe.send(None)
-    with drivers:
-        while True:
-            try:
-                key, episodes = pipe.recv()
-            except (EOFError, OSError):
-                return  # the parent is gone or has no more work
-            instance = plan.instances[key]
-            env = envs[instance.task]
-            env.load(instance)
-            start = env.snapshot()
-            pipe.send(encoder.encode(view(env, encoder), instance.instruction))
-            for policy, repeat in episodes:
-                env.restore(start)
-                outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat, action_noise=plan.action_noise)
-                pipe.send(make_row(instance, policy, repeat, outcome))
+
+    def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | Row]":
+        instance = plan.instances[job.instance]
+        env = envs[instance.task]
+        env.load(instance)
+        begin = env.snapshot()
+        if start == 0:
+            yield encoder.encode(view(env, encoder), instance.instruction)
+        for policy, repeat in job.episodes[max(0, start - 1) :]:
+            env.restore(begin)
+            outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat, action_noise=plan.action_noise)
+            yield make_row(instance, policy, repeat, outcome)
+
+    return work
+
+
+def worker_died(row: Row) -> bool:
+    """Whether there is no outcome because a worker died, so that the episode should be recorded again."""
+    return row.error is not None and row.error.startswith(WORKER_DIED)
 
 
 def error_row(plan: Plan, instance: str, policy: str, repeat: int, error: str) -> Row:
@@ -255,4 +183,5 @@ def make_row(instance: Instance, policy: str, repeat: int, outcome: Outcome) -> 
         fallback=outcome.fallback,
         error=outcome.error,
         axes=instance.axes,
+        robot=instance.other_robot,
     )

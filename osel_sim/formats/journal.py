@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim.core.errors import DataError
+from osel_sim.core.shown import escaped
 from osel_sim.interface.outcome import Outcome, Seconds
 
 
@@ -24,6 +25,7 @@ class Decision:
         index: 0, 1, 2 ... without gaps.
         propensities: probability of each policy when this one was chosen.
         reward: None when the outcome is an error; nothing is learnt from it then.
+        robot: the robot's name, None for the usual one: then it is not written down.
         Others: of the instance and of `Outcome`.
     """
 
@@ -49,6 +51,14 @@ class Decision:
     reward: float | None
     fallback: str | None
     error: str | None
+    robot: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As the journal has it."""
+        data = dataclasses.asdict(self)
+        if self.robot is None:
+            del data["robot"]
+        return data
 
     @property
     def outcome(self) -> Outcome:
@@ -67,7 +77,7 @@ def to_line(data: dict[str, Any]) -> str:
     Raises:
         ValueError: a NaN or infinity, which JSON does not have.
     """
-    return json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(", ", ": ")) + "\n"
+    return escaped(json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(", ", ": "))) + "\n"
 
 
 class Lines:
@@ -109,7 +119,7 @@ def read_lines(file: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
             return
         try:
             data = json.loads(line)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise DataError(f"{file}, line {number}: not JSON ({error})") from None
         if not isinstance(data, dict):
             raise DataError(f"{file}, line {number}: expected an object, got {type(data).__name__}")

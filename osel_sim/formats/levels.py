@@ -1,8 +1,12 @@
-"""Levels and axes: how far an instance is perturbed, and in what. Level 0 is clean; levels 1 to 3 turn up every axis a task allows, or one alone."""
+"""Levels and axes: how far an instance is perturbed, and in what. Level 0 is clean; levels 1 to 3 turn up every axis a task allows, or one alone.
+
+Also the key of an instance, which says all that fixes it.
+"""
 
 from collections.abc import Iterable, Mapping
 
 from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.interface.robot import DEFAULT_ROBOT
 
 LEVELS = (0, 1, 2, 3)
 AXES = ("light", "camera", "texture", "distractors", "colours", "sizes", "start", "robot", "phrasing")
@@ -61,6 +65,16 @@ def split_off(levels: Mapping[str, int]) -> tuple[int, str | None]:
 def label(level: int, axes: str | None) -> str:
     """`2`, `camera=2,light=1` or `1,camera=3`: the part of an instance's key that says how it is perturbed."""
     return str(level) if axes is None else axes if level == 0 else f"{level},{axes}"
+
+
+def instance_key(task: str, split: str, perturbed: str, seed: int, robot: str | None = None) -> str:
+    """`pick_place/test/2/7`, or `pick_place/test/2/7-UR5e` for another robot than the usual one.
+
+    Args:
+        perturbed: as `label` gives it.
+        robot: None is the usual one.
+    """
+    return f"{task}/{split}/{perturbed}/{seed}" + ("" if robot in (None, DEFAULT_ROBOT) else f"-{robot}")
 
 
 def _check(axis: str, level: int) -> None:

@@ -1,5 +1,6 @@
 """A policy file: what drives the robot, where it runs, what it needs to see, what it costs."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -123,7 +124,10 @@ def load_policy_file(file: Path) -> PolicySpec:
             url=section.get("url", str, None),
         )
         if remote.url is not None and not remote.url.startswith(("ws://", "wss://")):
-            raise section.error("url", f"must start with ws:// or wss://, got {remote.url!r}")
+            told = f", got {remote.url!r}" if re.fullmatch(r"\w+://[\w.-]*", remote.url) else ""  # else there may be a password in it
+            raise section.error("url", f"must start with ws:// or wss://{told}")
+        if remote.url is not None and not re.fullmatch(r"wss?://[^\s\"'<>]+", remote.url):
+            raise section.error("url", "must hold no spaces, quotes, < or > (within a password: %20, %22, %27, %3C, %3E)")
         section.done()
     cost = table.table("price", {})
     price = Price(*(cost.number(key, 0.0, 1e6, 0.0) for key in ("per_action", "per_call", "per_megabyte")))

@@ -4,11 +4,7 @@
 rollout log at hand. `replay.json` is written last and names the digest of `choices.npz`: where it is there, the rest is there and belongs to it.
 """
 
-import csv
-import hashlib
 import io
-import os
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.arrays import read_arrays
+from osel_sim.core.csv_text import to_csv
 from osel_sim.core.errors import DataError, UsageError
-from osel_sim.core.files import read_json, write_json
+from osel_sim.core.files import content_digest, is_partial, read_json, write_bytes, write_json
 
 SCHEMA_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
@@ -58,7 +56,7 @@ class Choices:
         return np.asarray(np.take_along_axis(self.outcomes(table), chosen, axis=2)[:, :, 0], np.float64)
 
 
-def check_folder(folder: Path, overwrite: bool) -> None:
+def check_replay_folder(folder: Path, overwrite: bool) -> None:
     """Refuse an output folder that cannot be used, before any work is done.
 
     Raises:
@@ -69,7 +67,7 @@ def check_folder(folder: Path, overwrite: bool) -> None:
     if (folder / REPLAY).exists() or (folder / OFF_POLICY).exists():
         if not overwrite:
             raise UsageError(f"--out {folder} holds a replay; add --overwrite to replace it, or give another folder")
-    elif folder.exists() and any(not item.name.endswith(".partial") and item.name != CHOICES for item in folder.iterdir()):
+    elif folder.exists() and any(not is_partial(item) and item.name != CHOICES for item in folder.iterdir()):
         raise UsageError(f"--out {folder} is not empty and holds no {REPLAY}; give a new folder")
 
 
@@ -85,14 +83,14 @@ def write_replay(folder: Path, result: Mapping[str, Any], choices: Choices, tabl
         ValueError: NaN or infinity in `result`.
     """
     content = _npz(choices)
-    digest = hashlib.sha256(content).hexdigest()
+    digest = content_digest(content)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / REPLAY).unlink(missing_ok=True)
-        _replace(folder / CHOICES, content)
+        write_bytes(folder / CHOICES, content)
         for name, rows in tables.items():
             if rows:
-                _replace(folder / f"{name}.csv", _csv(rows))
+                write_bytes(folder / f"{name}.csv", _csv(rows))
             else:
                 (folder / f"{name}.csv").unlink(missing_ok=True)
         write_json(folder / REPLAY, {"schema_version": SCHEMA_VERSION, **result, "choices_sha256": digest})
@@ -114,13 +112,13 @@ def read_replay(folder: Path) -> tuple[dict[str, Any], Choices]:
     file = folder / CHOICES
     try:
         content = file.read_bytes()
-        if hashlib.sha256(content).hexdigest() != result.get("choices_sha256"):
+        if content_digest(content) != result.get("choices_sha256"):
             raise DataError(f"{file} is damaged, or does not belong to the {REPLAY} beside it")
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            chosen = {key.removeprefix(_PREFIX): archive[key] for key in archive.files if key.startswith(_PREFIX)}
-            names = {key: tuple(str(value) for value in archive[key]) for key in ("instances", "policies")}
-            choices = Choices(names["instances"], names["policies"], archive["order"], archive["repeats"], chosen)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(file, "choices", content)
+        chosen = {key.removeprefix(_PREFIX): array for key, array in arrays.items() if key.startswith(_PREFIX)}
+        names = {key: tuple(str(value) for value in arrays[key]) for key in ("instances", "policies")}
+        choices = Choices(names["instances"], names["policies"], arrays["order"], arrays["repeats"], chosen)
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise DataError(f"{file}: not a replay's choices ({' '.join(str(error).split())})") from None
     return result, choices
 
@@ -152,15 +150,5 @@ def _npz(choices: Choices) -> bytes:
 
 
 def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    text = io.StringIO()
-    if rows:
-        writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    return text.getvalue().encode()
-
-
-def _replace(file: Path, content: bytes) -> None:
-    partial = file.with_name(f"{file.name}.partial")
-    partial.write_bytes(content)
-    os.replace(partial, file)
+    headings = list(rows[0]) if rows else []
+    return to_csv([headings, *([row.get(key) for key in headings] for row in rows)]).encode() if rows else b""

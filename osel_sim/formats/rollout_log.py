@@ -4,24 +4,26 @@ The contexts lie beside it in `contexts.npz` (osel_sim.context.cache). The file 
 instance, policy, repeat. Logs from elsewhere (osel_sim.ingest) fit the same columns; those that make no sense there are null.
 
 Version 2 of the schema has two columns more. `score`: what was measured where success is a matter of degree, such as minus an action MSE; it is null
-in what this suite records. `axes`: those perturbed beyond `level`, such as `camera=2`. Logs of version 1 are read as before, with both null.
+in what this suite records. `axes`: those perturbed beyond `level`, such as `camera=2`. Version 3 has `robot`, and is written only where one is
+not the usual Panda. Logs of earlier versions are read as before, with what they lack null.
 """
 
 import json
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import atomic
 from osel_sim.interface.outcome import Outcome, Seconds
 
 if TYPE_CHECKING:
     import pyarrow
 
-SCHEMA_VERSION = 2
-_COLUMNS_ADDED = {2: ("score", "axes")}
+SCHEMA_VERSION = 3
+_COLUMNS_ADDED = {2: ("score", "axes"), 3: ("robot",)}
 """Columns that came with a version; logs of an earlier one are read without them."""
 ROLLOUTS = "rollouts.parquet"
 DECLARED = "skills"
@@ -40,6 +42,7 @@ class Row:
         target, container: the object asked for and where it goes.
         upload ... motion: seconds, as in `Outcome`.
         score: a graded outcome, higher is better, where there is one; None otherwise. `success` is there all the same, such as "score >= 0.5".
+        robot: the robot's name, None for the usual one.
         Others: as in `Outcome`.
 
     Logs from elsewhere have None where a column makes no sense: no robot, no steps; no price known, no price. Never a made-up number.
@@ -70,6 +73,7 @@ class Row:
     error: str | None
     score: float | None = None
     axes: str | None = None
+    robot: str | None = None
 
     @property
     def outcome(self) -> Outcome:
@@ -88,15 +92,15 @@ class Row:
 _EPISODE = ("subgoals", "steps", "upload", "inference", "download", "motion", "calls", "actions", "price")
 
 
-def schema() -> "pyarrow.Schema":
+def schema(version: int = SCHEMA_VERSION) -> "pyarrow.Schema":
     """Columns of `rollouts.parquet` with their types; all but task, instance, policy, repeat and success may be null."""
     import pyarrow
 
     kinds = {"str": pyarrow.string(), "int": pyarrow.int64(), "float": pyarrow.float64(), "bool": pyarrow.bool_()}
     needed = ("task", "instance", "policy", "repeat", "success")
-    return pyarrow.schema(
-        [pyarrow.field(field.name, kinds[_type_name(field.type).removesuffix(" | None")], nullable=field.name not in needed) for field in fields(Row)]
-    )
+    later = {name for since, names in _COLUMNS_ADDED.items() if since > version for name in names}
+    types = {field.name: kinds[_type_name(field.type).removesuffix(" | None")] for field in fields(Row) if field.name not in later}
+    return pyarrow.schema([pyarrow.field(name, kind, nullable=name not in needed) for name, kind in types.items()])
 
 
 def write_rollouts(folder: Path, rows: Iterable[Row], metadata: dict[str, Any]) -> Path:
@@ -108,13 +112,17 @@ def write_rollouts(folder: Path, rows: Iterable[Row], metadata: dict[str, Any]) 
     import pyarrow
     import pyarrow.parquet
 
-    extra = {**metadata, "schema_version": SCHEMA_VERSION}
-    annotated = schema().with_metadata({_PREFIX + key.encode(): json.dumps(value, sort_keys=True).encode() for key, value in sorted(extra.items())})
+    rows = list(rows)
+    # A log of the usual robot alone stays one that earlier versions of osel_sim read.
+    version = SCHEMA_VERSION if any(row.robot is not None for row in rows) else 2
+    extra = {**metadata, "schema_version": version}
+    annotated = schema(version).with_metadata(
+        {_PREFIX + key.encode(): json.dumps(value, sort_keys=True).encode() for key, value in sorted(extra.items())}
+    )
     table = pyarrow.Table.from_pylist([vars(row) for row in rows], schema=annotated)
     file = folder / ROLLOUTS
-    partial = file.with_suffix(".partial")
-    pyarrow.parquet.write_table(table, partial, compression="zstd")
-    os.replace(partial, file)
+    with atomic(file) as partial:
+        pyarrow.parquet.write_table(table, partial, compression="zstd")
     return file
 
 
@@ -135,6 +143,7 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
         )
     try:
         found = pyarrow.parquet.read_schema(file)
+        check_rows(file)
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(f"{file} is not a Parquet file ({error})") from None
     raw = found.metadata or {}
@@ -145,8 +154,7 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
     version = metadata.get("schema_version")
     if not isinstance(version, int) or not 1 <= version <= SCHEMA_VERSION:
         raise DataError(f"{file}: osel_sim.schema_version must be 1 to {SCHEMA_VERSION}, got {version}")
-    later = {name for since, names in _COLUMNS_ADDED.items() if since > version for name in names}
-    columns = [name for name in schema().names if name not in later]
+    columns = schema(version).names
     if found.names != columns:
         raise DataError(f"{file}: columns must be {', '.join(columns)}; got {', '.join(found.names)}")
     _check_types(file, found)

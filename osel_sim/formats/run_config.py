@@ -15,12 +15,15 @@ from typing import Any
 
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
-from osel_sim.core.files import digest, read_json, write_json
+from osel_sim.core.files import digest, is_partial, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.task_file import TaskSpec
+from osel_sim.interface.robot import DEFAULT_ROBOT
 
 SCHEMA_VERSION = 1
 RUN = "run.json"
+UNSAID = ("robot",)
+"""Keys of a configuration that are left out where they say what is usual; they are compared all the same."""
 LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
 
 
@@ -57,14 +60,22 @@ def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -
     """What the files that a run depends on hold: the tasks', the policies', and their checkpoints' where those lie on this machine."""
     digests = {f"task {task.name}": digest(task.file) for task in tasks}
     for spec in policies:
-        digests[f"policy {spec.name}"] = digest(spec.file)
+        # A Python object has no file; its class is all that can be said of it.
+        digests[f"policy {spec.name}"] = digest(spec.file) if spec.file.is_file() else str(spec.file)
         checkpoint = content.resolve_checkpoint(spec.checkpoint) if spec.checkpoint else None
         if isinstance(checkpoint, Path):
             digests[f"checkpoint {spec.name}"] = digest(checkpoint)
     return digests
 
 
-def check_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:
+def robots_said(tasks: Iterable[TaskSpec]) -> dict[str, Any]:
+    """`robot` of a configuration: the one that does all tasks, or the robot of each; nothing where that is the usual one."""
+    robots = {task.name: task.robot for task in tasks}
+    names = set(robots.values())
+    return {"robot": robots if len(names) > 1 else names.pop()} if names != {DEFAULT_ROBOT} else {}
+
+
+def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:
     """Refuse an output folder that cannot be used, before anything heavy is loaded.
 
     Args:
@@ -81,13 +92,14 @@ def check_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> N
         if resume:
             raise UsageError(f"--resume: there is no run in {folder}; leave --resume out to begin one, or give the folder with --out")
         check_writable(folder)
-        if folder.exists() and any(item.name != "run.partial" for item in folder.iterdir()):
+        if folder.exists() and any(not is_partial(item) for item in folder.iterdir()):
             raise UsageError(f"--out {folder} is not empty and holds no {RUN}; give a new folder")
         return
     if not resume:
         raise UsageError(f"--out {folder} is in use; add --resume to go on with what is in it, or give another folder")
     was = read_json(file).get("configuration", {})
-    _compare(file, {key: was.get(key) for key in configuration}, json.loads(json.dumps(configuration)))
+    now = {**dict.fromkeys(UNSAID), **configuration} if configuration else {}
+    _compare(file, {key: was.get(key) for key in now}, json.loads(json.dumps(now)))
 
 
 def check_writable(folder: Path) -> None:
@@ -103,22 +115,30 @@ def check_writable(folder: Path) -> None:
         raise UsageError(f"--out {folder} cannot be written: no permission to write into {there}")
 
 
-def start_or_resume(folder: Path, configuration: dict[str, Any], ran_with: dict[str, Any], resume: bool) -> list[str]:
+def start_or_resume(
+    folder: Path, configuration: dict[str, Any], ran_with: dict[str, Any], resume: bool, settings: dict[str, Any] | None = None
+) -> list[str]:
     """Make the output folder with its `run.json`, or check that what is in it is the same run.
+
+    Args:
+        configuration: what came of the settings: names, digests, everything that results depend on; must be equal on resuming.
+        ran_with: what `environment` says.
+        settings: of the command, as they were given; `--config run.json` takes them from there.
 
     Returns:
         warnings: what is different in the environment of a resumed run.
 
     Raises:
-        UsageError: as `check_folder`, or the folder cannot be written, or the GL backend differs.
+        UsageError: as `check_run_folder`, or the folder cannot be written, or the GL backend differs.
         DataError: its `run.json` cannot be read.
     """
-    check_folder(folder, configuration, resume)
+    check_run_folder(folder, configuration, resume)
     file = folder / RUN
     if not resume:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            write_json(file, {"schema_version": SCHEMA_VERSION, "configuration": configuration, "environment": ran_with})
+            given = {} if settings is None else {"settings": settings}
+            write_json(file, {"schema_version": SCHEMA_VERSION, **given, "configuration": configuration, "environment": ran_with})
         except OSError as error:
             raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
         return []

@@ -10,6 +10,7 @@ from osel_sim.core.errors import ContentError
 from osel_sim.formats.levels import AXES
 from osel_sim.formats.terms import KINDS, PREDICATES, SKILLS, Term, parse_term
 from osel_sim.formats.validate import Table
+from osel_sim.interface.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     from osel_sim.formats.catalogue import Catalogue
@@ -80,6 +81,7 @@ class TaskSpec:
         subgoals: (name, predicate), in the order they are reached.
         plan: the scripted expert's skills.
         axes: the axes that levels may turn up in this task.
+        robot: name of the robot that does it (`osel_sim.sim.robots`).
     """
 
     name: str
@@ -103,6 +105,7 @@ class TaskSpec:
     plan: tuple[Term, ...]
     file: Path
     axes: tuple[str, ...] = AXES
+    robot: str = DEFAULT_ROBOT
 
     def entity(self, name: str) -> Entity:
         """The thing of that name."""
@@ -182,6 +185,7 @@ def load_task_file(file: Path, catalogue: "Catalogue | None" = None) -> TaskSpec
         plan=tuple(parse_term(expert, "plan", text, SKILLS, kinds) for text in expert.strings("plan")),
         file=file,
         axes=_axes(scene),
+        robot=table.get("robot", str, DEFAULT_ROBOT),
     )
     for section in (table, scene, language, goal, expert):
         section.done()

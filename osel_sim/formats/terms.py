@@ -1,9 +1,11 @@
 """Terms of task files, `name(role, ...)`: predicates of goals and subgoals, and skills of the scripted expert."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
+from osel_sim.core.registry import Registry
 from osel_sim.formats.validate import Table
+from osel_sim.interface.terms import Predicate, Signature, Skill
 
 KINDS = ("object", "container", "zone", "peg", "drawer", "button", "door")
 """Kinds of things. Objects lie loose; all others stand fast, some with a part that moves."""
@@ -14,34 +16,37 @@ HINGED = ("drawer", "door")
 ARTICULATED = (*HINGED, "button")
 """Kinds with a part that moves."""
 
-Signature = tuple[tuple[str, ...], ...]
-"""Kinds that each argument may be of."""
 
-PREDICATES: Mapping[str, Signature] = {
-    "near": (KINDS,),
-    "grasped": (KINDS,),
-    "lifted": (("object",),),
-    "released": (KINDS,),
-    "in": (("object",), RECEPTACLES),
-    "on": (("object",), ("object",)),
-    "opened": (HINGED,),
-    "closed": (HINGED,),
-    "pressed": (("button",),),
-}
-"""Known predicates (osel_sim.sim.predicates has their meaning)."""
+class Signatures(Mapping[str, Signature]):
+    """Name -> kinds of arguments, of predicates or skills; imported when they are asked for."""
 
-SKILLS: Mapping[str, Signature] = {
-    "reach": (KINDS,),
-    "grasp": (KINDS,),
-    "lift": (("object",),),
-    "move": (("object",), (*RECEPTACLES, "object")),
-    "place": (("object",), (*RECEPTACLES, "object")),
-    "push": (("object",), ("zone",)),
-    "open": (HINGED,),
-    "close": (HINGED,),
-    "press": (("button",),),
-}
-"""Known skills of the scripted expert (osel_sim.sim.expert)."""
+    def __init__(self, registry: Registry[Predicate] | Registry[Skill]) -> None:
+        self._registry = registry
+
+    def __getitem__(self, name: str) -> Signature:
+        if name not in self._registry:
+            raise KeyError(name)
+        return self._registry.load(name).kinds
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._registry)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self._registry)
+
+
+_PREDICATES = ("near", "grasped", "released", "lifted", "on", "opened", "closed", "pressed")
+_SKILLS = ("reach", "grasp", "lift", "move", "place", "push", "open", "close", "press")
+
+predicates = Registry(
+    "predicate",
+    "osel_sim.predicates",
+    {"in": "osel_sim.sim.predicates:inside"} | {name: f"osel_sim.sim.predicates:{name}" for name in _PREDICATES},
+    Predicate,
+)
+skills = Registry("skill", "osel_sim.skills", {name: f"osel_sim.sim.skills:{name}" for name in _SKILLS}, Skill)
+PREDICATES: Mapping[str, Signature] = Signatures(predicates)
+SKILLS: Mapping[str, Signature] = Signatures(skills)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim.core.errors import ContentError
+from osel_sim.core.shown import unprintable
 
 
 class Table:
@@ -21,11 +22,14 @@ class Table:
         """A TOML file's top table; raises ContentError where it cannot be read."""
         try:
             with file.open("rb") as handle:
-                return cls(tomllib.load(handle), file)
+                data = tomllib.load(handle)
         except OSError as error:
             raise ContentError(file, "file", f"cannot be read ({error.strerror})") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
             raise ContentError(file, "TOML", str(error)) from None
+        for key, value in unprintable(data):
+            raise ContentError(file, key, f"has a control character in it: {value[:80]!r}")
+        return cls(data, file)
 
     def error(self, key: str, problem: str) -> ContentError:
         """An error about one key of this table, to be raised."""

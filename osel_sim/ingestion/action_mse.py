@@ -5,7 +5,6 @@ frame on. A remote policy pays for its call as in an episode: delays of the netw
 (deadline, outage) has no error to measure; nobody takes over.
 """
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError, UsageError, did_you_mean
+from osel_sim.core.files import content_digest, file_digest
 from osel_sim.episodes.loop import Driver, episode_seed
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
-from osel_sim.ingestion.write import Instance, file_digest
+from osel_sim.ingestion.write import IngestedInstance
 from osel_sim.interface.encoder import Image
 from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
 
@@ -28,7 +28,7 @@ STATE, ACTION = "observation.state", "action"
 
 
 @dataclass(frozen=True)
-class Settings:
+class Measurement:
     """What is measured.
 
     Attributes:
@@ -53,7 +53,7 @@ class Dataset:
         DataError: it is none, or lacks a camera, the state or the actions of the suite's form.
     """
 
-    def __init__(self, folder: Path, cameras: Sequence[str], settings: Settings) -> None:
+    def __init__(self, folder: Path, cameras: Sequence[str], settings: Measurement) -> None:
         self.folder, self._settings, self._cameras = folder, settings, cameras
         info = folder / "meta" / "info.json"
         if not info.is_file():
@@ -112,13 +112,13 @@ class Sample:
         frame, end: index of the frame, and of the one after its episode's last.
     """
 
-    instance: Instance
+    instance: IngestedInstance
     dataset: Dataset
     frame: int
     end: int
 
 
-def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings: Settings) -> list[Sample]:
+def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings: Measurement) -> list[Sample]:
     """The frames that policies are to be measured on: `settings.frames` of each episode of each dataset.
 
     Raises:
@@ -135,17 +135,17 @@ def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings
         if names.count(name) > 1:
             raise UsageError(f"two datasets are called {name!r}, and the log needs a name for each")
         dataset = Dataset(folder, cameras, settings)
-        digest = hashlib.sha256("".join(file_digest(file) for file in sorted(folder.glob("data/**/*.parquet"))).encode()).hexdigest()
+        digest = content_digest(*(file_digest(file) for file in sorted(folder.glob("data/**/*.parquet"))))
         for episode, (start, end) in enumerate(dataset.episodes()):
             chosen = np.unique(np.linspace(start, end, settings.frames, endpoint=False).astype(int))
             for frame in map(int, chosen):
                 key = f"{name}/{episode:06d}/{frame - start:06d}"
-                instance = Instance(key, dataset.instruction(frame), digest, partial(dataset.images, frame))
+                instance = IngestedInstance(key, dataset.instruction(frame), digest, partial(dataset.images, frame))
                 samples.append(Sample(instance, dataset, frame, end))
     return samples
 
 
-def measure(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Settings) -> tuple[list[Row], dict[str, Any]]:
+def measure_errors(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Measurement) -> tuple[list[Row], dict[str, Any]]:
     """Ask every policy for its actions on every sample.
 
     Returns:
@@ -154,15 +154,15 @@ def measure(samples: Sequence[Sample], specs: Sequence[PolicySpec], settings: Se
     Raises:
         CheckpointError, RemoteError: a policy cannot be loaded or reached.
     """
-    from tqdm import tqdm  # type: ignore[import-untyped]
-
+    from osel_sim.core.progress import progress
     from osel_sim.episodes.drivers import Drivers
 
     rows = []
-    with Drivers(specs) as drivers:
-        for sample in tqdm(samples, unit="frame", dynamic_ncols=True):
+    with Drivers(specs) as drivers, progress(len(samples), "frame") as bar:
+        for sample in samples:
             observation = sample.dataset.observation(sample.frame)
             rows += [measure_one(sample, drivers[spec.name], observation, settings.tolerance) for spec in specs]
+            bar.update()
     return rows, {
         "datasets": sorted({sample.dataset.folder.resolve().name for sample in samples}),
         "frames": settings.frames,

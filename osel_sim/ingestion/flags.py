@@ -1,6 +1,5 @@
 """The command line's flags as what a mapping file would hold; what is wrong with it names the flag."""
 
-import argparse
 from typing import Any
 
 from osel_sim.core.errors import ContentError, UsageError, did_you_mean
@@ -21,7 +20,7 @@ class FlagTable(Table):
         return FlagTable(part.data, part.file, part.prefix)
 
 
-def as_table(options: argparse.Namespace, files: tuple[str, ...]) -> FlagTable:
+def as_table(options: Any, files: tuple[str, ...]) -> FlagTable:
     """A mapping's table.
 
     Args:
@@ -31,17 +30,23 @@ def as_table(options: argparse.Namespace, files: tuple[str, ...]) -> FlagTable:
     Raises:
         UsageError: a policy is named twice or not at all, or a value is given twice or for an unknown policy.
     """
-    names = options.policies or []
+    names = list(options.policies or ())
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"policy {name!r} is named twice after --policies")
     if not names and options.policy_column is None:
         raise UsageError("--policies or --policy-column is missing: a wide table needs the policies' names, a long one its column of them")
-    instance = {"text": options.text, "images": options.image, "group": options.group, "key": options.key, "duplicates": options.duplicates}
+    instance = {
+        "text": options.text,
+        "images": None if options.image is None else list(options.image),
+        "group": options.group,
+        "key": options.key,
+        "duplicates": options.duplicates,
+    }
     outcome: dict[str, Any] = {"policy": options.policy_column, "repeat": options.repeat_column}
     policies: dict[str, dict[str, Any]] = {name: {} for name in names}
     for key in VALUES:
-        for item in getattr(options, key) or []:
+        for item in getattr(options, key) or ():
             policy, equals, value = item.partition("=")
             if equals and policy in policies:
                 policies[policy][key] = _value(key, value, options.at_least)

@@ -1,6 +1,5 @@
 """An ingested log on disk: contexts first, resumable; then `ingest.json` and the log itself, at once."""
 
-import hashlib
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from osel_sim.core.errors import DataError, UsageError
-from osel_sim.core.files import read_json, write_json
+from osel_sim.core.files import content_digest, is_partial, read_json, write_json
 from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
 from osel_sim.interface.encoder import Encoder, Image
 
@@ -19,7 +18,7 @@ AUTOSAVE = 500
 
 
 @dataclass(frozen=True)
-class Instance:
+class IngestedInstance:
     """What an instance's context is made from.
 
     Attributes:
@@ -33,7 +32,7 @@ class Instance:
     images: Callable[[], Sequence[Image]]
 
 
-def check_out(folder: Path, instances: Iterable[Instance]) -> str:
+def check_out(folder: Path, instances: Iterable[IngestedInstance]) -> str:
     """Refuse an output folder that holds something else, before anything heavy is loaded.
 
     Returns:
@@ -44,19 +43,18 @@ def check_out(folder: Path, instances: Iterable[Instance]) -> str:
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is a file; give a folder")
-    total = hashlib.sha256(json.dumps([(item.key, item.text, item.digest) for item in instances], ensure_ascii=False).encode())
-    inputs = total.hexdigest()
+    inputs = content_digest(json.dumps([(item.key, item.text, item.digest) for item in instances], ensure_ascii=False))
     file = folder / INGEST
     if file.exists():
         if read_json(file).get("instances") != inputs:
             raise UsageError(f"--out {folder} holds the contexts of other instances, or of other files; give another folder")
-    elif folder.exists() and any(folder.iterdir()):
+    elif folder.exists() and any(not is_partial(item) for item in folder.iterdir()):
         raise UsageError(f"--out {folder} is not empty and holds no {INGEST}; give a new folder")
     return inputs
 
 
 def write_log(
-    folder: Path, inputs: str, rows: list[Row], instances: Sequence[Instance], load_encoder: Callable[[], Encoder], metadata: dict[str, Any]
+    folder: Path, inputs: str, rows: list[Row], instances: Sequence[IngestedInstance], load_encoder: Callable[[], Encoder], metadata: dict[str, Any]
 ) -> str:
     """Encode what is not encoded yet, with a progress bar, and write the log. An interrupted one goes on where it was.
 
@@ -72,9 +70,8 @@ def write_log(
     Raises:
         UsageError: another log is there.
     """
-    from tqdm import tqdm  # type: ignore[import-untyped]
-
     from osel_sim.context.cache import ContextCache
+    from osel_sim.core.progress import progress
 
     there = (folder / ROLLOUTS).exists()
     if there and read_rollouts(folder)[0] != rows:
@@ -85,10 +82,10 @@ def write_log(
     cache = ContextCache(folder, autosave=AUTOSAVE)
     missing = [item for item in instances if cache.get(encoder.identity, item.key) is None]
     try:
-        for item in tqdm(
-            missing, initial=len(instances) - len(missing), total=len(instances), unit="context", dynamic_ncols=True, disable=not missing
-        ):
-            cache.encode(encoder, item.key, item.images, item.text)
+        with progress(len(instances), "context", initial=len(instances) - len(missing), quiet=not missing) as bar:
+            for item in missing:
+                cache.encode(encoder, item.key, item.images, item.text)
+                bar.update()
     finally:
         cache.save()
     if not there:
@@ -112,9 +109,3 @@ def load_image(file: Path, where: str) -> Image:
             return np.asarray(image.convert("RGB"), np.uint8)
     except (OSError, ValueError, SyntaxError) as error:  # Pillow says SyntaxError for a broken PNG
         raise DataError(f"{where}: image {file} cannot be read ({' '.join(str(error).split())})") from None
-
-
-def file_digest(file: Path) -> str:
-    """SHA-256 of a file."""
-    with file.open("rb") as handle:
-        return hashlib.file_digest(handle, "sha256").hexdigest()

@@ -3,6 +3,8 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from osel_sim.core.shown import shown
+
 
 @dataclass(frozen=True)
 class Seconds:
@@ -42,6 +44,12 @@ class Outcome:
     price: float
     fallback: str | None = None
     error: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("fallback", "error"):  # servers and policies have a say in them
+            told = getattr(self, name)
+            if isinstance(told, str):
+                object.__setattr__(self, name, shown(told))
 
     def to_dict(self) -> dict[str, Any]:
         """As plain data, `seconds` a dictionary of its own."""

@@ -1,6 +1,5 @@
 """Whether a LeRobot checkpoint and a policy file fit together, said before anything runs."""
 
-import difflib
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
-from osel_sim.core.errors import CheckpointError
+from osel_sim.core.errors import CheckpointError, nearest
 from osel_sim.formats.mapping import ENVIRONMENT_STATES, STATE_PARTS, Mapping
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.policy import ACTION_DIM
@@ -78,12 +77,12 @@ def _images(spec: PolicySpec, wanted: list[str]) -> Iterator[str]:
     given = camera_keys(spec.mapping, spec.cameras)
     for key in sorted(set(wanted) - set(given) - set(spec.mapping.blank)):
         free = [name for name in given if name not in wanted]
-        near = next(iter(difflib.get_close_matches(key, free, n=1, cutoff=0.0)), None)
+        near = next(iter(nearest(key, free, cutoff=0.0)), None)
         advice = "name a camera for it in [observation] cameras" if near is None else f'perhaps [mapping.images] {given[near]} = "{key}"'
         yield f'it wants {key}, the policy file gives {", ".join(sorted(given))} ({advice}; or leave it black: [mapping] blank = ["{key}"])'
     for key in sorted((set(given) | set(spec.mapping.blank)) - set(wanted)):
         if key in spec.mapping.images.values() or key in spec.mapping.blank:
-            meant = difflib.get_close_matches(key, wanted, n=1, cutoff=0.0)
+            meant = nearest(key, wanted, cutoff=0.0)
             yield f"[mapping] gives it {key}, which it does not know" + (f": did you mean {meant[0]!r}?" if meant else "")
 
 

@@ -21,8 +21,9 @@ from torch import Tensor
 
 from osel_sim.core import content
 from osel_sim.core.errors import CheckpointError
-from osel_sim.core.hub import offline_if_unreachable
+from osel_sim.core.hub import download, offline_if_unreachable
 from osel_sim.core.torch_settings import threads
+from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.policy import Actions, Observation, Policy
 from osel_sim.policy import register
@@ -30,21 +31,24 @@ from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, che
 from osel_sim.policy.mapping import actions_of, state_of
 from osel_sim.policy.perception_step import PerceptionStep
 from osel_sim.policy.text import embed
+from osel_sim.policy.trust import check_checkpoint
 
 
 def load(spec: PolicySpec) -> Callable[[], Policy]:
     """Load the weights once; the result makes sessions that share them, each with its own state.
 
     Raises:
-        CheckpointError: missing, unreadable, without access to the hub, or not fitting the policy file.
+        CheckpointError: missing, unreadable, without access to the hub, asking for code that is not allowed, or not fitting the policy file.
     """
-    checkpoint = str(content.resolve_checkpoint(spec.checkpoint))
     if not spec.checkpoint:
         raise CheckpointError(f"{spec.file}: checkpoint: is missing, a policy of kind 'lerobot' needs a folder or a hub name")
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    with quiet(), contextlib.nullcontext() if Path(checkpoint).is_dir() else offline_if_unreachable():
+    given = content.resolve_checkpoint(spec.checkpoint)
+    with quiet(), no_foreign_code(), contextlib.nullcontext() if Path(given).is_dir() else offline_if_unreachable():
         register()
         register_third_party_plugins()
+        checkpoint = str(_folder(spec, str(given)))
+        _check_code(spec, checkpoint)
         config = _config(spec, checkpoint)
         config.device = device
         check_processors(spec, checkpoint)
@@ -97,7 +101,7 @@ class LeRobotPolicy:
             batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping))
         if self._context is not None:
             batch[OBS_ENV_STATE] = self._context
-        with torch.inference_mode(), threads(1), drawing(self._instruction, self._calls):
+        with torch.inference_mode(), threads(1), no_foreign_code(), drawing(self._instruction, self._calls):
             prepared = {key: value for key, value in self._before(batch).items() if isinstance(value, Tensor)}
             # the postprocessor knows single actions (batch, 7): a chunk's steps take the batch's place
             stepwise = (config.n_obs_steps or 1) > 1
@@ -107,15 +111,31 @@ class LeRobotPolicy:
         return actions_of(actions.float().cpu().numpy(), self._mapping).clip(-1.0, 1.0).astype(np.float32)
 
 
-def _config(spec: PolicySpec, checkpoint: str) -> PreTrainedConfig:
-    a_path = checkpoint.startswith(("/", ".")) or checkpoint.count("/") != 1  # hub names are owner/name
-    if a_path and not Path(checkpoint).is_dir():
+def _folder(spec: PolicySpec, checkpoint: str) -> Path:
+    """The checkpoint on this machine. What comes from the hub is fetched first and loaded from where it lies: what is checked is what is loaded."""
+    if Path(checkpoint).is_dir():
+        return Path(checkpoint)
+    if checkpoint.startswith(("/", ".")) or checkpoint.count("/") != 1:  # hub names are owner/name
         raise CheckpointError(
             f"{spec.file}: checkpoint {spec.checkpoint!r} is no folder; train one with python -m osel_sim.train --policy {spec.name}"
         )
     try:
+        return download(checkpoint)
+    except Exception as error:  # the hub client has its own
+        raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} cannot be read: {_line(error)}") from error
+
+
+def _check_code(spec: PolicySpec, checkpoint: str) -> None:
+    try:
+        check_checkpoint(Path(checkpoint))
+    except CheckpointError as error:
+        raise type(error)(f"{spec.file}: {error}") from None
+
+
+def _config(spec: PolicySpec, checkpoint: str) -> PreTrainedConfig:
+    try:
         return PreTrainedConfig.from_pretrained(checkpoint)
-    except Exception as error:  # the hub client, JSON and draccus all have their own
+    except Exception as error:  # JSON and draccus have their own
         raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} cannot be read: {_line(error)}") from error
 
 
@@ -141,8 +161,9 @@ def _weights(spec: PolicySpec, checkpoint: str, config: PreTrainedConfig) -> Pre
 
 def _line(error: Exception) -> str:
     """The first line of an error, which is what fits into one."""
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0] if lines else ''}"
+    failed = what_failed(error)
+    lines = str(failed).strip().splitlines() or [""]
+    return lines[0] if isinstance(failed, ForeignCodeError) else f"{type(failed).__name__}: {lines[0]}"
 
 
 def _image(image: np.ndarray[Any, Any], size: tuple[int, ...]) -> Tensor:

@@ -1,5 +1,6 @@
 """Applies a policy file's `[mapping]`: our observations in a policy's words, its actions in ours."""
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ def _part(state: NDArray[np.float64], part: str) -> NDArray[np.float64]:
     if part == "gripper":
         return np.clip((state[6:7] - state[7:8]) / (2 * OPEN_FINGER), 0.0, 1.0)
     if part in ("quaternion", "euler"):
-        return quaternion(state[3:6]) if part == "quaternion" else euler(state[3:6])
+        return orientation(state[3:6], part)
     return {"position": state[:3], "axis_angle": state[3:6], "fingers": state[6:8]}[part]
 
 
@@ -68,18 +69,18 @@ def actions_of(value: Any, mapping: Mapping) -> NDArray[Any]:
     return result
 
 
-def quaternion(axis_angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axis-angle (3,) -> quaternion (x, y, z, w) with w >= 0."""
-    angle = float(np.linalg.norm(axis_angle))
-    axis = axis_angle / angle if angle > 0 else np.zeros(3)
-    result = np.concatenate([axis * np.sin(angle / 2), [np.cos(angle / 2)]])
-    return -result if result[3] < 0 else result
+def orientation(axis_angle: NDArray[np.float64], form: str) -> NDArray[np.float64]:
+    """Axis-angle (3,) in another form.
 
+    Args:
+        form: `quaternion` (x, y, z, w) with w >= 0, or `euler`: roll, pitch and yaw in radians, turned about the fixed x, then y, then z axis; at a
+            pitch of 90 degrees, where roll and yaw mean the same turn, yaw is 0.
+    """
+    from scipy.spatial.transform import Rotation
 
-def euler(axis_angle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Axis-angle (3,) -> roll, pitch and yaw (3,) in radians, turned about the fixed x, then y, then z axis."""
-    x, y, z, w = quaternion(axis_angle)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return np.array([roll, pitch, yaw])
+    rotation = Rotation.from_rotvec(axis_angle)
+    if form == "quaternion":
+        return np.asarray(rotation.as_quat(canonical=True), np.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # at that pitch
+        return np.asarray(rotation.as_euler("xyz"), np.float64)

@@ -12,7 +12,7 @@ import torch.nn.functional as functional
 from torch import Tensor, nn
 
 from osel_sim.policy.grounding import PLACE_FEATURES, STATE_FEATURES, GroundingCamera, Sizes, TextEncoder
-from osel_sim.policy.scene import Scene, look
+from osel_sim.policy.scene import PerceivedScene, look
 
 
 class PerceptionSizes(Sizes, Protocol):
@@ -64,7 +64,7 @@ def percept_size(config: PerceptionSizes, cameras: int) -> int:
     return cameras * per_camera + STATE_FEATURES + config.text_dim + config.queries * 7
 
 
-def perceive(text: TextEncoder, cameras: nn.ModuleList, image_keys: list[str], batch: dict[str, Tensor]) -> tuple[Tensor, Scene]:
+def perceive(text: TextEncoder, cameras: nn.ModuleList, image_keys: list[str], batch: dict[str, Tensor]) -> tuple[Tensor, PerceivedScene]:
     """Look at a batch.
 
     Returns:
@@ -97,6 +97,6 @@ class Perception(nn.Module):
         self.text = TextEncoder(config)
         self.cameras = nn.ModuleList(KeypointCamera(config, moves) for moves in mounted.values())
 
-    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, Scene]:
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, PerceivedScene]:
         """See `perceive`."""
         return perceive(self.text, self.cameras, self.image_keys, batch)

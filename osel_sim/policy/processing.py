@@ -105,7 +105,10 @@ def area_weights(inputs: int, outputs: int) -> Tensor:
 
 
 def rotation_columns(axis_angle: Tensor) -> Tensor:
-    """First two columns, (..., 6), of the rotation matrix of an axis-angle vector (..., 3) in radians (Rodrigues' formula)."""
+    """First two columns, (..., 6), of the rotation matrix of an axis-angle vector (..., 3) in radians (Rodrigues' formula).
+
+    On the tensor's device and in its precision, as the checkpoints were trained; scipy's Rotation would fetch every batch from a GPU.
+    """
     angle = axis_angle.norm(dim=-1, keepdim=True)
     x, y, z = (axis_angle / angle.clamp_min(1e-8)).unbind(-1)
     cosine, sine = angle.cos()[..., 0], angle.sin()[..., 0]

@@ -30,7 +30,7 @@ LABELS = (GROUNDING_TOKENS, GROUNDING_POSITIONS, GROUNDING_PLACES, ACTIVE_POSITI
 
 
 @dataclass
-class Scene:
+class PerceivedScene:
     """What a policy made of a batch before it thinks about actions.
 
     Attributes:
@@ -50,7 +50,7 @@ class Scene:
     fused: Tensor
 
 
-def look(text: TextEncoder, cameras: Iterable[nn.Module], image_keys: list[str], batch: Mapping[str, Tensor]) -> Scene:
+def look(text: TextEncoder, cameras: Iterable[nn.Module], image_keys: list[str], batch: Mapping[str, Tensor]) -> PerceivedScene:
     """See and read: nothing here knows the state but cameras that move with the gripper."""
     state = torch.cat([batch[OBS_STATE][:, :3], batch[OBS_ROTATION], batch[OBS_STATE][:, 6:8]], dim=-1).float()
     tokens = batch[OBS_LANGUAGE_TOKENS][:, None]
@@ -66,7 +66,7 @@ def look(text: TextEncoder, cameras: Iterable[nn.Module], image_keys: list[str],
         queries = read.queries.view(rows, pairs, *read.queries.shape[1:])
         grounded = [camera.ground(view, queries, state) for camera, view in zip(eyes, views, strict=True)]
         fused = fuse([grounding.estimate for grounding in grounded])
-    return Scene(state, read, read.sentence.view(rows, pairs, -1)[:, 0], views, raw, grounded, fused)
+    return PerceivedScene(state, read, read.sentence.view(rows, pairs, -1)[:, 0], views, raw, grounded, fused)
 
 
 class Weights(Protocol):

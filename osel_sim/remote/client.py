@@ -13,12 +13,13 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.core.errors import PolicyError, RemoteError
+from osel_sim.core.shown import shown
 from osel_sim.formats.mapping import Mapping
 from osel_sim.interface.policy import Actions, Observation
 from osel_sim.policy.local import check_actions
 from osel_sim.policy.mapping import actions_of, message_of
 from osel_sim.remote.codec import ProtocolError, pack, unpack
-from osel_sim.remote.protocol import IMAGES, RESET, Greeting
+from osel_sim.remote.protocol import IMAGES, RESET, Greeting, check_header
 
 MAX_ANSWER = 16 << 20  # bytes; a chunk of 1,000 actions has 56,000
 CLOSE_SECONDS = 1.0
@@ -47,16 +48,22 @@ class RemoteClient:
 
     Args:
         url: `ws://host:port` or `wss://...`.
-        token: sent as `Authorization: Api-Key ...`; None sends none.
+        token: sent as `Authorization: Api-Key ...`; none is sent if it is None or empty.
         timeout: real seconds for one answer, and for connecting.
         expect: what a server of ours must say it is; None takes any.
         mapping: names and conventions of a server that is not ours.
+
+    Raises:
+        UsageError: the token is not fit for a header.
     """
 
     def __init__(
         self, url: str, token: str | None = None, timeout: float = 30.0, expect: Greeting | None = None, mapping: Mapping | None = None
     ) -> None:
-        self.url, self._token, self._timeout, self._expect = url, token, timeout, expect
+        self.url = shown(url)
+        """The address without what is secret in it; errors begin with it."""
+        self._address, self._timeout, self._expect = url, timeout, expect
+        self._token = None if token is None else check_header(token)
         self._mapping = mapping or Mapping()
         self._connection: ClientConnection | None = None
         self._hang_up = contextlib.ExitStack()
@@ -142,14 +149,14 @@ class RemoteClient:
         headers = {"Authorization": f"Api-Key {self._token}"} if self._token else None
         try:
             opening = connect(
-                self.url,
+                self._address,
                 additional_headers=headers,
                 compression=None,
                 max_size=MAX_ANSWER,
                 open_timeout=self._timeout,
                 close_timeout=CLOSE_SECONDS,
                 ping_interval=None,  # a server that computes in its event loop (openpi's) answers no pings meanwhile
-                proxy=None if _is_loopback(self.url) else True,
+                proxy=None if _is_loopback(self._address) else True,
             )
             connection = self._hang_up.enter_context(opening)
         except InvalidStatus as error:

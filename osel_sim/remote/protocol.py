@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from osel_sim.core.errors import OselError, UsageError
+from osel_sim.core.shown import TOKEN_VARIABLE as TOKEN_VARIABLE  # where others look for it
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
 from osel_sim.remote.codec import ProtocolError
 
 PROTOCOL = "osel_sim/1"
 RESET = "osel_sim/reset"
-TOKEN_VARIABLE = "OSEL_SIM_TOKEN"  # the environment variable that holds a token
 HEALTH = "/healthz"
 MAX_INSTRUCTION = 2000  # characters
 IMAGES = "observation.images."
@@ -153,6 +153,25 @@ def check_token(token: str) -> str:
     """
     if not re.fullmatch(r"[\x21-\x7e]{8,256}", token):
         raise UsageError("a token must be 8 to 256 printable ASCII characters without spaces")
+    return token
+
+
+def check_header(token: str) -> str:
+    """A token of another's server, which need not be as long as ours, but has to fit into an HTTP header.
+
+    Raises:
+        UsageError: it does not; says where, and not what.
+    """
+    ends = (0, len(token) - 1)  # HTTP drops spaces there
+    wrong = next((at for at, character in enumerate(token) if not " " <= character <= "~" or (character == " " and at in ends)), None)
+    if wrong is not None:
+        code = ord(token[wrong])
+        control = code < 0x20 or 0x7F <= code < 0xA0
+        kind = {0x0A: "a line end", 0x0D: "a line end", 0x20: "a space"}.get(code, "a control character" if control else "no ASCII character")
+        raise UsageError(
+            f"the token in {TOKEN_VARIABLE} cannot be sent: character {wrong + 1} of {len(token)} is {kind}; "
+            "did a line end or a quotation mark come with it?"
+        )
     return token
 
 

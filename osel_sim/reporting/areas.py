@@ -13,7 +13,7 @@ from osel_sim.analysis.log import Array
 from osel_sim.reporting.charts import HEIGHT, WIDTH, Look, Panel, numbers, panel, unfolded
 from osel_sim.reporting.palette import LIGHT
 
-_DARKEST = 0.4
+DARKEST = 0.36
 """Opacity of a cell's colour at most: the number in it is read on it, light and dark."""
 
 _ROW = 24
@@ -46,7 +46,7 @@ def heatmap(title: str, cells: Sequence[Cell], look: Look) -> Panel:
     rows, names = (list(dict.fromkeys(getattr(cell, side) for cell in cells)) for side in ("row", "column"))
     level = 6.2 * max(map(len, names)) < 0.74 * WIDTH / len(names)  # the page does the same for its own width
     records = [
-        {"row": cell.row, "name": cell.column, "shade": round(_DARKEST * min(max(cell.shade, 0.0), 1.0), 3), "text": cell.text, "about": cell.about}
+        {"row": cell.row, "name": cell.column, "shade": round(DARKEST * min(max(cell.shade, 0.0), 1.0), 3), "text": cell.text, "about": cell.about}
         for cell in cells
     ]
     base = alt.Chart(alt.InlineData(values=records))

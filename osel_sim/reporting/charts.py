@@ -1,6 +1,7 @@
 """A figure: Altair charts side by side, with the words about them. Page, PNG, SVG and notebook all show the same Vega-Lite specification."""
 
 import math
+import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,6 +11,7 @@ import altair as alt
 import numpy as np
 from numpy.typing import ArrayLike
 
+from osel_sim.core.shown import all_shown
 from osel_sim.reporting.palette import LIGHT
 
 WIDTH, WIDE, HEIGHT = 440, 760, 260
@@ -28,7 +30,6 @@ CONFIG: dict[str, Any] = {
     "background": LIGHT["surface"],
     "font": "system-ui, -apple-system, Segoe UI, Roboto, Helvetica Neue, Arial, sans-serif",
     "aria": False,  # the figure as a whole has an alternative text; one for each of a thousand dots helps nobody
-    "view": {"stroke": None},
     "axis": {
         **{"labelColor": _MUTED, "titleColor": _INK, "gridColor": _GRID, "domainColor": _GRID, "tickColor": _GRID},
         **{"labelFontSize": 11, "titleFontSize": 12, "titleFontWeight": "normal", "labelLimit": 240, "titlePadding": 8},
@@ -124,17 +125,22 @@ class Figure:
     def chart(self) -> alt.ConcatChart:
         """All of it as one Altair chart."""
         width = WIDTH if len(self.panels) > 1 else WIDE
-        panels = [panel.properties(width=width) for panel in self.panels]
         legend: Literal["shared", "independent"] = "shared" if self.one_legend else "independent"
-        chart = alt.concat(*panels, columns=COLUMNS, title=alt.Title(self.title, fontSize=15, offset=14), spacing=28)
-        chart = chart.resolve_scale(color=legend, shape=legend, strokeDash=legend, opacity="independent")
-        whole: alt.ConcatChart = chart.add_params(alt.param(name="hidden", value=sorted(self.hidden))).configure(**CONFIG)
-        return whole
+        # All at once: each method of a chart would copy it with its data.
+        return alt.concat(
+            *self.panels,
+            columns=COLUMNS,
+            spacing=28,
+            title=alt.Title(self.title, fontSize=15, offset=14),
+            resolve=alt.Resolve(scale=alt.ScaleResolveMap(color=legend, shape=legend, strokeDash=legend, opacity="independent")),
+            params=[alt.param(name="hidden", value=sorted(self.hidden)).param],
+            config=alt.Config(**{**CONFIG, "view": {"stroke": None, "continuousWidth": width, "discreteWidth": width}}),
+        )
 
     @cached_property
     def spec(self) -> dict[str, Any]:
-        """The chart as Vega-Lite's JSON, which the page embeds and the images are made from."""
-        return dict(self.chart.to_dict(validate=False))  # the tests validate; it takes longer than all the rest
+        """The chart as Vega-Lite's JSON, its texts as they may be shown. The page embeds it, and the images are made from it."""
+        return dict(all_shown(self.chart.to_dict(validate=False)))  # the tests validate; it takes longer than all the rest
 
     def _repr_mimebundle_(self, *arguments: Any, **keywords: Any) -> Any:
         """Shows itself in a notebook."""
@@ -146,8 +152,14 @@ def to_images(figure: Figure) -> dict[str, bytes]:
     import vl_convert
 
     # Nothing in a specification names an address; none could be reached.
-    png = vl_convert.vegalite_to_png(figure.spec, scale=_SCALE, allowed_base_urls=[])
-    return {"png": png, "svg": vl_convert.vegalite_to_svg(figure.spec, allowed_base_urls=[]).encode()}
+    svg = _renumbered(vl_convert.vegalite_to_svg(figure.spec, allowed_base_urls=[]))
+    return {"svg": svg.encode(), "png": vl_convert.svg_to_png(svg, scale=_SCALE)}
+
+
+def _renumbered(svg: str) -> str:
+    """Clip paths numbered from 0: Vega goes on counting from one picture to the next, and the same picture would not be the same bytes."""
+    numbers: dict[str, str] = {}
+    return re.sub(r'(id="|="url\(#)(clip\d+)', lambda found: found[1] + numbers.setdefault(found[2], f"clip{len(numbers)}"), svg)
 
 
 def numbers(values: ArrayLike) -> list[float | None]:

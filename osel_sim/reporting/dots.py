@@ -147,14 +147,14 @@ def apart(x: NDArray[np.float64], y: NDArray[np.float64], width: float = WIDTH, 
         width, height: pixels over which they spread.
     """
     from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import distance_matrix
+    from scipy.spatial.distance import cdist
 
     offsets = np.zeros((len(x), 2))
     known = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(known) < 2:
         return offsets
     pixels = np.stack([_unit(x[known]) * width, _unit(y[known]) * height], axis=1)
-    count, group = connected_components(distance_matrix(pixels, pixels) < _APART)
+    count, group = connected_components(cdist(pixels, pixels) < _APART)
     for number in range(count):
         members = known[group == number]
         if len(members) > 1:

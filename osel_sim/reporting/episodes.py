@@ -116,7 +116,7 @@ def _instance(log: LoggedOutcomes, row: int, scene: bytes | None, letters: int) 
     instance = log.instances[row]
     known = log.success[row][np.isfinite(log.success[row])]
     about: dict[str, Any] = {"number": row, "key": instance.key, "task": instance.task, "differ": bool(known.size and known.min() != known.max())}
-    for name in ("instruction", "target", "container", "phrasing"):
+    for name in ("instruction", "target", "container", "phrasing", "robot"):
         if value := getattr(instance, name):
             about[name] = shortened(value, letters)
     # What osel_sim.report can draw with --scenes: an instance of a task file, which its seed makes again.

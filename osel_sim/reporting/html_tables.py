@@ -1,13 +1,12 @@
 """Tables: what they hold, as CSV, and their cells as text for the page."""
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from osel_sim.analysis.estimate import Estimate
+from osel_sim.core import csv_text
 from osel_sim.core.errors import UsageError
 
 Cell = str | int | float | bool | Estimate | None
@@ -81,12 +80,10 @@ def shortened(text: str, most: int) -> str:
 def to_csv(table: Table) -> str:
     """All digits; an estimate takes three columns: itself, `_low`, `_high`. What is not there is empty."""
     wide = {column.key for column in table.columns if any(isinstance(row[column.key], Estimate) for row in table.rows)}
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow([name for column in table.columns for name in _headings(column.key, column.key in wide)])
-    for row in table.rows:
-        writer.writerow([text for column in table.columns for text in _values(row[column.key], column.key in wide)])
-    return buffer.getvalue()
+    headings = [name for column in table.columns for name in _headings(column.key, column.key in wide)]
+    return csv_text.to_csv(
+        [headings, *([text for column in table.columns for text in _values(row[column.key], column.key in wide)] for row in table.rows)]
+    )
 
 
 def to_text(cell: Cell, column: Column) -> str:

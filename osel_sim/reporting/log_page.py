@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from osel_sim.analysis.clusters import complete_instances
+from osel_sim.analysis.clusters import complete_rows
 from osel_sim.analysis.estimate import Estimate
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.outcomes import remote_policies
@@ -72,10 +72,16 @@ def log_sections(log: LoggedOutcomes, weights: RewardWeights, replayed: Replayed
 def log_facts(log: LoggedOutcomes, weights: RewardWeights) -> list[tuple[str, str]]:
     """What a log was made from."""
     facts = [
-        *(("log", str(log.source)), ("tasks", ", ".join(sorted(set(log.labels("task"))))), ("policies", ", ".join(log.policies))),
+        *(("log", str(log.source)), ("tasks", ", ".join(sorted(set(log.labels("task"))))), *_robots(log), ("policies", ", ".join(log.policies))),
         *(("instances", f"{len(log):,}"), ("repeats", str(log.repeats)), ("encoder", log.encoder), ("reward", formula(weights))),
     ]
     return facts + [(name, digest[:12]) for name, digest in dict(log.metadata.get("content") or {}).items()]
+
+
+def _robots(log: LoggedOutcomes) -> list[tuple[str, str]]:
+    """Which robots there are, where it is not the usual one alone."""
+    names = sorted(set(log.labels("robot")) - {""})
+    return [("robots", ", ".join(names))] if names else []
 
 
 def few(names: Sequence[str], most: int = 3) -> str:
@@ -99,7 +105,7 @@ def bounds(low: float, high: float) -> str:
 
 
 def _verdict(log: LoggedOutcomes, weights: RewardWeights, routing: Routing | None) -> Verdict:
-    rewards = log.mean_rewards(weights)[complete_instances(log, weights)]
+    rewards = log.mean_rewards(weights)[complete_rows(log, weights)]
     means = rewards.mean(axis=0)
     best, oracle = int(means.argmax()), float(rewards.max(axis=1).mean())
     success = float(np.nanmean(log.success[:, best]))

@@ -1,7 +1,6 @@
 """One self-contained HTML page from figures, tables and words, with the figures' PNG and SVG and the tables' CSV beside it."""
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -9,6 +8,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
+from osel_sim.core.files import write_bytes
+from osel_sim.core.shown import all_shown, shown
 from osel_sim.reporting.charts import Figure, to_images
 from osel_sim.reporting.html_tables import Table, to_csv, to_parts
 from osel_sim.reporting.palette import DARK, LIGHT
@@ -108,9 +109,7 @@ def write_page(page: Page, folder: Path) -> Path:
     for name, content in files.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        partial = file.with_name(f".{file.name}.partial")
-        partial.write_bytes(content)
-        os.replace(partial, file)
+        write_bytes(file, content)
     return folder / PAGE
 
 
@@ -120,12 +119,13 @@ def to_html(page: Page) -> str:
     from markupsafe import Markup
 
     template = resources.files("osel_sim.reporting") / "template"
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalize)
     data = {
         "palette": {"light": LIGHT, "dark": DARK},
         "figures": {figure.name: figure.spec for figure in page.figures},
         "episodes": page.episodes.data if page.episodes else None,
     }
+    environment.filters["shown"] = shown
     return environment.from_string((template / "report.html.j2").read_text(encoding="utf-8")).render(
         page=page,
         parts=to_parts,
@@ -147,7 +147,12 @@ def _vega() -> str:
     return f"(() => {{{script}}})();".replace("</script", "<\\/script")
 
 
+def _finalize(value: Any) -> Any:
+    """What the template puts in: texts as they may be shown; style, script and data are the page's own."""
+    return shown(value) if type(value) is str else value
+
+
 def _embedded(data: Mapping[str, Any]) -> str:
-    """JSON that cannot end the script element it stands in, whatever is in it."""
-    text = json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(",", ":"))
+    """JSON that cannot end the script element it stands in, whatever is in it; its texts as they may be shown."""
+    text = json.dumps(all_shown(data), allow_nan=False, ensure_ascii=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")

@@ -17,7 +17,7 @@ from osel_sim.selection.reward import RewardWeights
 _MOST_ROWS = 12
 """Groups on the first screen; the figure of the policies has them all."""
 
-WORDS = {"task": "task", "target": "object asked for"}
+WORDS = {"task": "task", "robot": "robot", "target": "object asked for"}
 """Attributes of an instance that a page goes by, as it calls them."""
 
 

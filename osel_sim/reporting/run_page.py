@@ -50,7 +50,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     run = _read(folder)
     selector = run.live.selector
     streams = _streams(run, selector)
-    look = look_of(list(streams), run.log.policies, {f"always {policy}": policy for policy in run.log.policies})
+    look = _look(run, streams)
     blocks: list[Block] = [curve_figure(streams, look, run.log.policies)]
     if HINDSIGHT in streams:
         blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look)]
@@ -68,6 +68,17 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     routes = route_figure(run.log, run.weights, chosen)
     episodes = _episodes(run, scenes(run.log), beside or folder)
     return Page("Live run", title, _verdict(run, selector, streams), sections, _facts(run), episodes, routes)
+
+
+def run_curve(folder: Path) -> Figure:
+    """The learning curve of a live run's folder, as its page has it.
+
+    Raises:
+        DataError: no run there, or no decision in it.
+    """
+    run = _read(folder)
+    streams = _streams(run, run.live.selector)
+    return curve_figure(streams, _look(run, streams), run.log.policies)
 
 
 @dataclass(frozen=True)
@@ -120,6 +131,10 @@ def _streams(run: _Run, selector: str) -> dict[str, Stream]:
         best = np.where(complete, np.nan_to_num(rewards, nan=-np.inf).argmax(axis=1), 0)
         streams[HINDSIGHT] = stream(np.where(complete, tables[:, rows, best], np.nan))
     return streams
+
+
+def _look(run: _Run, streams: Mapping[str, Stream]) -> Look:
+    return look_of(list(streams), run.log.policies, {f"always {policy}": policy for policy in run.log.policies})
 
 
 def _propensities(run: _Run) -> Figure:

@@ -7,6 +7,7 @@ import numpy as np
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.core import content
 from osel_sim.core.errors import DataError
+from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.reporting.episodes import jpeg
 
 CAMERA, SIZE = "agentview", 240
@@ -28,17 +29,19 @@ def render_scenes(log: LoggedOutcomes, count: int, tasks: Path | None = None) ->
     from osel_sim.sim.env import TaskEnv
     from osel_sim.sim.gl import choose_backend
     from osel_sim.sim.instance import make_instance
+    from osel_sim.sim.robots import with_robot
 
     rows = np.unique(np.linspace(0, len(log) - 1, min(count, len(log))).round().astype(int)).tolist()
-    specs = {name: load_task_file(content.find("tasks", name, tasks)) for name in {log.instances[row].task for row in rows}}
+    wanted = sorted({(log.instances[row].task, log.instances[row].robot or DEFAULT_ROBOT) for row in rows})
     choose_backend()
     pictures: dict[int, bytes] = {}
-    for name, task in specs.items():
+    for name, robot in wanted:
+        task = with_robot([load_task_file(content.find("tasks", name, tasks))], robot)[0]
         env = TaskEnv(task)
         try:
             for row in rows:
                 logged = log.instances[row]
-                if logged.task != name:
+                if (logged.task, logged.robot or DEFAULT_ROBOT) != (name, robot):
                     continue
                 if logged.seed is None or logged.level is None or logged.split is None:
                     raise DataError(f"{log.source}: instance {logged.key!r} has no seed, level and split, so it cannot be rendered again")

@@ -1,20 +1,21 @@
 """Bayesian linear regression of each policy's reward on features of the context, and choosing by it."""
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import solve_triangular
-from scipy.special import ndtr
 
 from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.core.files import content_digest
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.features import Array, Features, Sketch
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
+from osel_sim.statistics.best import gauss_hermite, probability_of_best
 
 INTERCEPT = 0.5
 """Prior variance of a policy's mean reward, in units of the noise. Strong: no context is needed to find the best single policy."""
@@ -31,8 +32,36 @@ GROWTH = 1.25
 WARM = 2000
 """Of more warm contexts than these, evenly spaced ones are taken."""
 
-NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(32)
-WEIGHTS = WEIGHTS / WEIGHTS.sum()
+
+@dataclass(frozen=True)
+class Prior:
+    """What a `BayesianSelector` is told before its first decision, and how it explores.
+
+    Attributes:
+        signals: candidates for the prior variance of w relative to the noise, > 0.
+        optimism, chance: weights of the two ways to explore, >= 0.
+        expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
+            learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
+        warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
+        skills: what policies are said to be able to do, as a first guess of their success; None: nothing is said.
+
+    Raises:
+        UsageError: a number out of range.
+    """
+
+    signals: Sequence[float]
+    optimism: float = 0.0
+    chance: float = 0.0
+    expected_costs: Mapping[str, float] | None = None
+    warm_contexts: ArrayLike | None = None
+    skills: Skills | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in (("optimism", self.optimism), ("chance", self.chance)):
+            if not (math.isfinite(value) and value >= 0.0):
+                raise UsageError(f"{name} must be finite and >= 0, got {value}")
+        if not self.signals or not all(math.isfinite(signal) and signal > 0.0 for signal in self.signals):
+            raise UsageError(f"signals must be one or more finite numbers > 0, got {list(self.signals)}")
 
 
 class BayesianSelector(SelectorBase):
@@ -52,53 +81,31 @@ class BayesianSelector(SelectorBase):
     Args:
         policies, context_dim, seed: see `SelectorBase`.
         features: fresh ones, of this selector alone.
-        signals: candidates for the prior variance of w relative to the noise, > 0.
-        optimism, chance: see above, >= 0.
-        expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
-            learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
-        skills: what policies are said to be able to do, as a first guess of their success; None: nothing is said.
-        warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
+        prior: what it is told.
 
     Raises:
-        UsageError: a number out of range, or contexts of another form.
+        UsageError: contexts of another form.
         UnknownNameError: `expected_costs` lacks a policy.
     """
 
     off_policy: ClassVar[bool] = True
 
-    def __init__(
-        self,
-        policies: Sequence[str],
-        context_dim: int,
-        seed: int,
-        features: Features,
-        *,
-        signals: Sequence[float],
-        optimism: float,
-        chance: float,
-        expected_costs: Mapping[str, float] | None,
-        warm_contexts: ArrayLike | None,
-        skills: Skills | None = None,
-    ) -> None:
+    def __init__(self, policies: Sequence[str], context_dim: int, seed: int, features: Features, prior: Prior) -> None:
         super().__init__(policies, context_dim, seed)
-        if skills is not None and skills.dimension != context_dim:
-            raise UsageError(f"the examples of skills have length {skills.dimension}, contexts {context_dim}")
-        self._skills = skills
-        for name, value in (("optimism", optimism), ("chance", chance)):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UsageError(f"{name} must be finite and >= 0, got {value}")
-        if not signals or not all(math.isfinite(signal) and signal > 0.0 for signal in signals):
-            raise UsageError(f"signals must be one or more finite numbers > 0, got {list(signals)}")
-        self._costs_declared = None if expected_costs is None else {name: float(cost) for name, cost in expected_costs.items()}
+        self._skills = prior.skills
+        if self._skills is not None and self._skills.dimension != context_dim:
+            raise UsageError(f"the examples of skills have length {self._skills.dimension}, contexts {context_dim}")
+        costs = prior.expected_costs
+        self._costs_declared = None if costs is None else {name: float(cost) for name, cost in costs.items()}
         self._costs = np.array([self._cost(name) for name in self.policies])
-        self._signals = [float(signal) for signal in signals]
-        self.optimism, self.chance = float(optimism), float(chance)
+        self._signals = [float(signal) for signal in prior.signals]
+        self.optimism, self.chance = float(prior.optimism), float(prior.chance)
         self._sketch = Sketch(context_dim)
-        self._warm, self._warm_digest = self._check_warm(warm_contexts)
+        self._warm, self._warm_digest = self._check_warm(prior.warm_contexts)
         self._features = features
         self._generator = np.random.default_rng(seed)
         self._contexts: list[NDArray[np.float32]] = []
-        self._head_count = 1 if skills is None else 2
+        self._head_count = 1 if self._skills is None else 2
         self._heads: list[Array] = []
         self._chosen: list[int] = []
         self._targets: list[float] = []
@@ -130,7 +137,8 @@ class BayesianSelector(SelectorBase):
         deviations = np.sqrt(self._noise * variances)
         # 1 / variance is how many decisions, this policy's, told about contexts like this one.
         optimism = self.optimism * math.sqrt(1.0 + 0.25 * math.log1p((1.0 / variances).sum()))
-        propensities = highest((self._means * rows).sum(axis=1) - self._costs + optimism * deviations, self.chance * deviations)
+        scores = (self._means * rows).sum(axis=1) - self._costs + optimism * deviations
+        propensities = probability_of_best(scores, self.chance * deviations, gauss_hermite())
         index = int(self._generator.choice(len(self.policies), p=propensities))
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
@@ -228,7 +236,7 @@ class BayesianSelector(SelectorBase):
         if table.ndim != 2 or table.shape[1] != self.context_dim or not len(table) or not np.isfinite(table).all():
             raise UsageError(f"warm_contexts must be a finite table (n, {self.context_dim}), got shape {table.shape}")
         few = table[np.linspace(0, len(table) - 1, min(WARM, len(table))).astype(np.int64)]
-        return self._sketch(few).astype(np.float64), hashlib.sha256(table.tobytes()).hexdigest()
+        return self._sketch(few).astype(np.float64), content_digest(table.tobytes())
 
     def _add_policy(self, name: str) -> None:
         self._costs = np.append(self._costs, self._cost(name))
@@ -254,20 +262,3 @@ class BayesianSelector(SelectorBase):
         self._signal, self._noise, self._next_fit = state["model"]
         self._generator.bit_generator.state = state["random"]
         self._features.load({key.removeprefix("features."): value for key, value in state.items() if key.startswith("features.")})
-
-
-def highest(means: Array, deviations: Array) -> Array:
-    """Probability that each of several independent Gaussians is the highest, (n,), summing to 1; those without deviation that tie share it.
-
-    Integrated numerically over each one's own distribution; exact as the probabilities of a choice, because the choice is drawn from them.
-    """
-    if len(means) == 1:
-        return np.ones(1)
-    if not (deviations > 0.0).all():
-        best = means == means.max()
-        return np.asarray(best / best.sum(), np.float64)
-    values = means[:, None] + deviations[:, None] * NODES
-    below = ndtr((values[:, None, :] - means[None, :, None]) / deviations[None, :, None])
-    below[np.arange(len(means)), np.arange(len(means))] = 1.0
-    probabilities = below.prod(axis=1) @ WEIGHTS
-    return np.asarray(probabilities / probabilities.sum())

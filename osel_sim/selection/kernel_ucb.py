@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from numpy.typing import ArrayLike
 
 from osel_sim.core.errors import UsageError
-from osel_sim.selection.bayesian import BayesianSelector
+from osel_sim.selection.bayesian import BayesianSelector, Prior
 from osel_sim.selection.features import Landmarks
 from osel_sim.selection.skills import Skills
 
@@ -25,7 +25,7 @@ class KernelUCBSelector(BayesianSelector):
         skills: which policies declare what, as `episodes.declared_skills` gives it; a first guess, overruled by outcomes. None: nothing is known.
         warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
         components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
-        signals, optimism, chance: see `BayesianSelector`. A little chance keeps every propensity above 0 where policies are close.
+        signals, optimism, chance: see `Prior`. A little chance keeps every propensity above 0 where policies are close.
 
     Raises:
         UsageError: a number out of range, or contexts (those of the skills, too) of another form.
@@ -54,18 +54,8 @@ class KernelUCBSelector(BayesianSelector):
         if components < 1 or landmarks < 1 or not width > 0.0:
             raise UsageError(f"components and landmarks must be at least 1 and width positive, got {components}, {landmarks}, {width}")
         self._own = {"components": components, "whitening": whitening, "width": width, "landmarks": landmarks}
-        super().__init__(
-            policies,
-            context_dim,
-            seed,
-            Landmarks(components, whitening, width, landmarks),
-            signals=signals,
-            optimism=optimism,
-            chance=chance,
-            expected_costs=expected_costs,
-            warm_contexts=warm_contexts,
-            skills=skills,
-        )
+        prior = Prior(signals, optimism, chance, expected_costs, warm_contexts, skills)
+        super().__init__(policies, context_dim, seed, Landmarks(components, whitening, width, landmarks), prior)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 from numpy.typing import ArrayLike
 
 from osel_sim.core.errors import UsageError
-from osel_sim.selection.bayesian import BayesianSelector
+from osel_sim.selection.bayesian import BayesianSelector, Prior
 from osel_sim.selection.features import Components
 
 
@@ -16,40 +16,18 @@ class LinearSelector(BayesianSelector):
     Args:
         policies, context_dim, seed: see `SelectorBase`.
         components: principal components of the contexts seen, each whitened to the same variance.
-        optimism, chance, signals, expected_costs, warm_contexts: see `BayesianSelector`.
+        prior: what it is told, and how it explores.
 
     Raises:
         UsageError: a number out of range, or contexts of another form.
         UnknownNameError: `expected_costs` lacks a policy.
     """
 
-    def __init__(
-        self,
-        policies: Sequence[str],
-        context_dim: int,
-        seed: int,
-        *,
-        components: int,
-        optimism: float,
-        chance: float,
-        signals: Sequence[float],
-        expected_costs: Mapping[str, float] | None,
-        warm_contexts: ArrayLike | None,
-    ) -> None:
+    def __init__(self, policies: Sequence[str], context_dim: int, seed: int, components: int, prior: Prior) -> None:
         if components < 1:
             raise UsageError(f"components must be at least 1, got {components}")
         self.components = components
-        super().__init__(
-            policies,
-            context_dim,
-            seed,
-            Components(components, whitening=1.0),
-            signals=signals,
-            optimism=optimism,
-            chance=chance,
-            expected_costs=expected_costs,
-            warm_contexts=warm_contexts,
-        )
+        super().__init__(policies, context_dim, seed, Components(components, whitening=1.0), prior)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -58,7 +36,7 @@ class LinearSelector(BayesianSelector):
 
 
 class LinUCBSelector(LinearSelector):
-    """Chooses the policy whose reward is highest at `optimism` deviations above its mean (Li et al. 2010). See `LinearSelector` for the arguments."""
+    """Chooses the policy whose reward is highest at `optimism` deviations above its mean (Li et al. 2010). Arguments: `LinearSelector`, `Prior`."""
 
     name: ClassVar[str] = "linucb"
 
@@ -74,21 +52,11 @@ class LinUCBSelector(LinearSelector):
         expected_costs: Mapping[str, float] | None = None,
         warm_contexts: ArrayLike | None = None,
     ) -> None:
-        super().__init__(
-            policies,
-            context_dim,
-            seed,
-            components=components,
-            optimism=optimism,
-            chance=0.0,
-            signals=signals,
-            expected_costs=expected_costs,
-            warm_contexts=warm_contexts,
-        )
+        super().__init__(policies, context_dim, seed, components, Prior(signals, optimism, 0.0, expected_costs, warm_contexts))
 
 
 class LinTSSelector(LinearSelector):
-    """Chooses the policy whose reward is highest in a draw from what is believed (Agrawal and Goyal 2013). See `LinearSelector` for the arguments.
+    """Chooses the policy whose reward is highest in a draw from what is believed (Agrawal and Goyal 2013). Arguments: `LinearSelector`, `Prior`.
 
     `chance` scales the deviation of the draws. 1 is Thompson sampling proper, which explores more than some thousand decisions repay.
     """
@@ -107,14 +75,4 @@ class LinTSSelector(LinearSelector):
         expected_costs: Mapping[str, float] | None = None,
         warm_contexts: ArrayLike | None = None,
     ) -> None:
-        super().__init__(
-            policies,
-            context_dim,
-            seed,
-            components=components,
-            optimism=0.0,
-            chance=chance,
-            signals=signals,
-            expected_costs=expected_costs,
-            warm_contexts=warm_contexts,
-        )
+        super().__init__(policies, context_dim, seed, components, Prior(signals, 0.0, chance, expected_costs, warm_contexts))

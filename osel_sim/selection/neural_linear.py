@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from osel_sim.core.errors import UsageError
+from osel_sim.core.torch_settings import threads
 from osel_sim.interface.selector import State
-from osel_sim.selection.bayesian import BayesianSelector
+from osel_sim.selection.bayesian import BayesianSelector, Prior
 from osel_sim.selection.features import Array, Components
 
 STEPS, RATE, DECAY = 150, 0.02, 1e-3
-"""Of the network's training: steps on all decisions at once, Adam's learning rate, weight decay."""
+"""Of the network's training: steps on all decisions at once, AdamW's learning rate and weight decay."""
 
 
 class NeuralLinearSelector(BayesianSelector):
@@ -24,7 +25,7 @@ class NeuralLinearSelector(BayesianSelector):
         policies, context_dim, seed: see `SelectorBase`.
         components: principal components of the contexts seen, whitened: the network's input.
         hidden: units of the hidden layer.
-        chance, signals, expected_costs, warm_contexts: see `BayesianSelector`.
+        chance, signals, expected_costs, warm_contexts: see `Prior`.
 
     Raises:
         UsageError: a number out of range, or contexts of another form.
@@ -50,17 +51,8 @@ class NeuralLinearSelector(BayesianSelector):
             raise UsageError(f"components and hidden must be at least 1, got {components} and {hidden}")
         self._own = {"components": components, "hidden": hidden}
         self._hidden = HiddenLayer(components, hidden)
-        super().__init__(
-            policies,
-            context_dim,
-            seed,
-            self._hidden,
-            signals=signals,
-            optimism=0.0,
-            chance=chance,
-            expected_costs=expected_costs,
-            warm_contexts=warm_contexts,
-        )
+        prior = Prior(signals, chance=chance, expected_costs=expected_costs, warm_contexts=warm_contexts)
+        super().__init__(policies, context_dim, seed, self._hidden, prior)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -95,27 +87,25 @@ class HiddenLayer:
         self._set_scale(inputs)
 
     def train(self, contexts: Array, chosen: NDArray[np.int64], targets: Array, policies: int) -> None:
-        """Least squares on the chosen policy's reward, by Adam.
+        """Least squares on the chosen policy's reward, by AdamW.
 
         Args:
             contexts: (n, sketched dim). chosen: (n,) columns. targets: (n,) rewards + costs. policies: number of outputs.
         """
-        inputs, rows = self._inputs(contexts), np.arange(len(contexts))
-        centred = targets - targets.mean()
-        weights = [self._weights, np.zeros((self.dim, policies))]
-        first, second = [np.zeros_like(w) for w in weights], [np.zeros_like(w) for w in weights]
-        for step in range(1, STEPS + 1):
-            activation = inputs @ weights[0]
-            hidden = np.maximum(activation, 0.0)
-            error = np.zeros((len(contexts), policies))
-            error[rows, chosen] = ((hidden @ weights[1])[rows, chosen] - centred) / len(contexts)
-            gradients = [inputs.T @ ((error @ weights[1].T) * (activation > 0.0)), hidden.T @ error]
-            for index, gradient in enumerate(gradients):
-                first[index] += 0.1 * (gradient - first[index])
-                second[index] += 0.001 * (gradient**2 - second[index])
-                change = (first[index] / (1.0 - 0.9**step)) / (np.sqrt(second[index] / (1.0 - 0.999**step)) + 1e-8)
-                weights[index] = weights[index] - RATE * (change + DECAY * weights[index])
-        self._weights = weights[0]
+        import torch
+
+        inputs = self._inputs(contexts)
+        seen, columns, centred = (torch.from_numpy(values) for values in (inputs, chosen[:, None], targets - targets.mean()))
+        first = torch.nn.Parameter(torch.from_numpy(self._weights.copy()))
+        second = torch.nn.Parameter(torch.zeros(self.dim, policies, dtype=torch.float64))
+        optimiser = torch.optim.AdamW([first, second], lr=RATE, weight_decay=DECAY, fused=True)
+        with threads(1):  # a matrix product's last bits depend on how many share it
+            for _ in range(STEPS):
+                optimiser.zero_grad()
+                predicted = (torch.relu(seen @ first) @ second).gather(1, columns)[:, 0]
+                torch.autograd.backward((predicted - centred).square().sum() / (2 * len(centred)))
+                optimiser.step()
+        self._weights = first.detach().numpy()
         self._set_scale(inputs)
 
     def transform(self, contexts: Array) -> Array:

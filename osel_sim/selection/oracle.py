@@ -29,38 +29,6 @@ class Comparison:
     regret: float
 
 
-def best_single(rewards: ArrayLike) -> int:
-    """Column of the policy with the best mean reward over instances on which every policy has one; the first, where several share it.
-
-    Args:
-        rewards: (instances, policies); NaN where there is no valid outcome.
-    """
-    table, complete = _table(rewards)
-    return int(table[complete].mean(axis=0).argmax())
-
-
-def hindsight(rewards: ArrayLike) -> NDArray[np.float64]:
-    """Reward of the best policy of each instance, (instances,); NaN where a policy has none.
-
-    Args:
-        rewards: (instances, policies); NaN where there is no valid outcome.
-    """
-    table, _ = _table(rewards)
-    return np.asarray(table.max(axis=1), np.float64)
-
-
-def cumulative_regret(rewards: ArrayLike, chosen: ArrayLike) -> NDArray[np.float64]:
-    """Sum of (hindsight oracle - received) up to each instance, (instances,); instances where a policy has no reward add nothing.
-
-    Args:
-        rewards: (instances, policies); NaN where there is no valid outcome.
-        chosen: (instances,) column chosen for each.
-    """
-    table, complete = _table(rewards)
-    loss = table.max(axis=1) - table[np.arange(len(table)), np.asarray(chosen, np.int64)]
-    return np.asarray(np.where(complete, loss, 0.0).cumsum(), np.float64)
-
-
 def compare(rewards: ArrayLike, chosen: ArrayLike) -> Comparison:
     """Set what was chosen against the best single policy and the hindsight oracle, on the instances on which every policy has a reward.
 

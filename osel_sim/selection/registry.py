@@ -2,11 +2,10 @@
 
 import inspect
 from collections.abc import Mapping, Sequence
-from importlib import import_module
-from importlib.metadata import entry_points
 from typing import Any, cast
 
 from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.core.registry import Registry
 from osel_sim.interface.selector import Selector
 
 ENTRY_POINTS = "osel_sim.selectors"
@@ -29,10 +28,12 @@ BUILT_IN = {
     "vw_squarecb": "osel_sim.selection.vowpal:SquareCBSelector",
 }
 
+SELECTORS = Registry[Any]("selector", ENTRY_POINTS, BUILT_IN)
+
 
 def selector_locations() -> dict[str, str]:
     """Name -> `module:Class` of every selector, installed plugins included; a plugin cannot replace a built-in one."""
-    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)} | BUILT_IN
+    return SELECTORS.locations()
 
 
 def make_selector(name: str, policies: Sequence[str], context_dim: int, seed: int, **settings: Any) -> Selector:
@@ -50,15 +51,14 @@ def make_selector(name: str, policies: Sequence[str], context_dim: int, seed: in
         UsageError: settings this selector does not have.
     """
     kind, colon, policy = name.partition(":")
-    locations = selector_locations()
-    if kind not in locations or (colon and kind != "fixed"):
-        raise UnknownNameError("selector", name, locations, "fixed:POLICY for always the same one")
+    if kind not in SELECTORS or (colon and kind != "fixed"):
+        raise UnknownNameError("selector", name, SELECTORS, "fixed:POLICY for always the same one")
     if kind == "fixed":
         if colon:
             settings = {**settings, "policy": policy}
         elif "policy" not in settings:
             raise UsageError(f"selector 'fixed' needs a policy, such as {f'fixed:{policies[0]}' if policies else 'fixed:POLICY'!r}")
-    factory = _factory(locations[kind])
+    factory = SELECTORS.load(kind)
     known = _settings(factory)
     for setting in settings:
         if setting not in known:
@@ -72,7 +72,7 @@ def setting_names(name: str) -> list[str]:
     Raises:
         UnknownNameError: no such selector.
     """
-    return _settings(_find(name))
+    return _settings(_load(name))
 
 
 def wanted_of(name: str, known: Mapping[str, Any]) -> dict[str, Any]:
@@ -91,19 +91,11 @@ def learns_off_policy(name: str) -> bool:
     Raises:
         UnknownNameError: no such selector.
     """
-    return bool(getattr(_find(name), "off_policy", False))
+    return bool(getattr(_load(name), "off_policy", False))
 
 
-def _find(name: str) -> Any:
-    kind, locations = name.partition(":")[0], selector_locations()
-    if kind not in locations:
-        raise UnknownNameError("selector", name, locations)
-    return _factory(locations[kind])
-
-
-def _factory(location: str) -> Any:
-    module, _, attribute = location.partition(":")
-    return getattr(import_module(module), attribute)
+def _load(name: str) -> Any:
+    return SELECTORS.load(name.partition(":")[0])
 
 
 def _settings(factory: Any) -> list[str]:

@@ -1,6 +1,5 @@
 """What policies are said to be able to do, as something that a selector can know of a context before its first decision."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
+from osel_sim.core.files import content_digest
 from osel_sim.interface.selector import Context
 
 Array = NDArray[np.float64]
@@ -56,11 +56,8 @@ class Skills:
     @cached_property
     def digest(self) -> str:
         """Of everything, for a selector's settings."""
-        total = hashlib.sha256()
-        for name in sorted(self.examples):
-            total.update(name.encode() + b"\0" + np.ascontiguousarray(self.examples[name], np.float32).tobytes())
-        total.update(repr(sorted((policy, sorted(names)) for policy, names in self.able.items())).encode())
-        return total.hexdigest()
+        examples = (name.encode() + b"\0" + np.ascontiguousarray(self.examples[name], np.float32).tobytes() for name in sorted(self.examples))
+        return content_digest(*examples, repr(sorted((policy, sorted(names)) for policy, names in self.able.items())))
 
     @cached_property
     def reliability(self) -> float:

@@ -1,15 +1,13 @@
-"""A selector's state on disk: one safetensors file, arrays as tensors, everything else as JSON in its metadata. No pickle."""
+"""A selector's state on disk: one safetensors file, arrays as tensors, everything else as JSON in its metadata."""
 
-import json
-import os
 from pathlib import Path
 
 import numpy as np
 
-from osel_sim.core.errors import DataError
+from osel_sim.core.tensor_file import TensorFile
 from osel_sim.interface.selector import State
 
-FORMAT = "osel_sim.selector_state.v1"
+FILE = TensorFile("selector state", "osel_sim.selector_state.v1")
 
 
 def save_state(state: State, path: Path) -> None:
@@ -18,21 +16,8 @@ def save_state(state: State, path: Path) -> None:
     Raises:
         DataError: the file cannot be written.
     """
-    from safetensors.numpy import save
-
-    arrays = {name: np.ascontiguousarray(value) if value.ndim else value for name, value in state.items() if isinstance(value, np.ndarray)}
-    values = {name: value for name, value in state.items() if name not in arrays}
-    content = save(arrays, metadata={"format": FORMAT, "values": json.dumps(values, sort_keys=True)})
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as handle:
-            handle.write(content)
-            handle.flush()
-            os.fsync(handle.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise DataError(f"{path}: selector state cannot be written ({error.strerror})") from None
+    arrays = {name: value for name, value in state.items() if isinstance(value, np.ndarray)}
+    FILE.write(path, arrays, {name: value for name, value in state.items() if name not in arrays})
 
 
 def load_state(path: Path) -> State:
@@ -41,17 +26,5 @@ def load_state(path: Path) -> State:
     Raises:
         DataError: missing, unreadable, damaged, or another kind of file.
     """
-    from safetensors import SafetensorError, safe_open
-
-    if not path.is_file():
-        raise DataError(f"{path}: no such selector state")
-    try:
-        with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            if metadata.get("format") != FORMAT:
-                raise DataError(f"{path}: not a selector state (format {metadata.get('format')!r}, expected {FORMAT!r})")
-            state: State = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (a file handle, not a dict)
-        state.update(json.loads(metadata["values"]))
-    except (OSError, SafetensorError, KeyError, ValueError) as error:
-        raise DataError(f"{path}: selector state cannot be read ({error})") from None
-    return state
+    arrays, values = FILE.read(path)
+    return {**arrays, **values}

@@ -4,13 +4,10 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
-
-NODES = 512
-"""Points of each policy's belief at which the probability that it is the best is evaluated."""
+from osel_sim.statistics.best import probability_of_best
 
 
 class ThompsonSelector(SelectorBase):
@@ -62,21 +59,3 @@ class ThompsonSelector(SelectorBase):
     def _load(self, state: State) -> None:
         self._counts, self._means, self._squares = state["counts"].copy(), state["means"].copy(), state["squares"]
         self._generator.bit_generator.state = state["random"]
-
-
-def probability_of_best(means: NDArray[np.float64], deviations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Probability of each of several independent Gaussian quantities to be the highest, (P,), to about 1 / `NODES`; they sum to 1.
-
-    Args:
-        means: (P,).
-        deviations: (P,) standard deviations, > 0.
-    """
-    from scipy.special import ndtr, ndtri
-
-    at = ndtri((np.arange(NODES) + 0.5) / NODES)
-    points = means[:, None] + deviations[:, None] * at  # (P, NODES), of equal probability
-    below = ndtr((points[:, None, :] - means[None, :, None]) / deviations[None, :, None])  # (P, P, NODES): point of one, below it the other
-    own = np.arange(len(means))
-    below[own, own] = 1.0
-    probabilities = below.prod(axis=1).mean(axis=1)
-    return np.asarray(probabilities / probabilities.sum(), np.float64)

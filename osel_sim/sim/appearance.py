@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from osel_sim.sim import table_tops as tables
 from osel_sim.sim.perturbation import CLEAN, CameraShift, Perturbation
-from osel_sim.sim.scene import AGENTVIEW_TARGET, CAMERA_NAMES
+from osel_sim.sim.scene import AGENTVIEW_TARGET
 
 Array = NDArray[np.float64]
 
@@ -43,15 +43,16 @@ class Appearance:
 
     Args:
         root_bodies: thing -> name of its top body.
+        cameras: `agentview` and `wrist` -> their names in the model.
 
     Attributes:
         perturbation: what it looks like now.
         mesh_sizes: mesh -> factor by which its vertices are scaled now.
     """
 
-    def __init__(self, model: Any, root_bodies: Mapping[str, str]) -> None:
+    def __init__(self, model: Any, root_bodies: Mapping[str, str], cameras: Mapping[str, str]) -> None:
         self.model = model
-        self.root_bodies = dict(root_bodies)
+        self.root_bodies, self.cameras = dict(root_bodies), dict(cameras)
         self.perturbation = CLEAN
         self.mesh_sizes: dict[int, float] = {}
         self._sizes: dict[str, float] = {}
@@ -97,11 +98,11 @@ class Appearance:
 
         model = self.model
         if perturbation.camera != CameraShift():
-            index = model.camera(CAMERA_NAMES["agentview"]).id
+            index = model.camera(self.cameras["agentview"]).id
             model.cam_pos[index], model.cam_quat[index] = _shifted(model.cam_pos[index].copy(), model.cam_quat[index].copy(), perturbation.camera)
             model.cam_fovy[index] += perturbation.camera.fovy
         if any(perturbation.wrist):
-            index = model.camera(CAMERA_NAMES["wrist"]).id
+            index = model.camera(self.cameras["wrist"]).id
             offset, turned = np.empty(3), np.empty(4)
             own = model.cam_quat[index].copy()
             mujoco.mju_rotVecQuat(offset, np.array(perturbation.wrist[:3]), own)

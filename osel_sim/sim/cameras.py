@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
 from osel_sim.sim.appearance import Appearance
-from osel_sim.sim.scene import CAMERA_NAMES, full_model
+from osel_sim.sim.scene import full_model
 
 Image = NDArray[np.uint8]
 
@@ -72,13 +72,13 @@ class Cameras:
         return self._full_data
 
     def _full_appearance(self) -> Appearance:
-        return _full_appearance(self._xml, tuple(self._appearance.root_bodies.items()))
+        return _full_appearance(self._xml, tuple(self._appearance.root_bodies.items()), tuple(self._appearance.cameras.items()))
 
 
 @functools.lru_cache(maxsize=2)
-def _full_appearance(xml: str, root_bodies: tuple[tuple[str, str], ...]) -> Appearance:
+def _full_appearance(xml: str, root_bodies: tuple[tuple[str, str], ...], cameras: tuple[tuple[str, str], ...]) -> Appearance:
     """One full model a scene; whoever renders it next makes it look like its own world."""
-    return Appearance(full_model(xml), dict(root_bodies))
+    return Appearance(full_model(xml), dict(root_bodies), dict(cameras))
 
 
 class _Renderer:
@@ -114,7 +114,7 @@ class _Renderer:
 
     def render(self, data: Any, camera: str, width: int, height: int) -> Image:
         mujoco = self._mujoco
-        self._camera.fixedcamid = self._model.camera(CAMERA_NAMES.get(camera, camera)).id
+        self._camera.fixedcamid = self._model.camera(self._appearance.cameras.get(camera, camera)).id
         with self._only_in_view(data, width / height):
             mujoco.mjv_updateScene(self._model, data, self._option, None, self._camera, mujoco.mjtCatBit.mjCAT_ALL, self._scene)
         self._gl.make_current()
@@ -172,9 +172,12 @@ def in_view(model: Any, data: Any, camera: int, aspect: float) -> NDArray[np.boo
     return seen
 
 
-def project(model: Any, data: Any, points: NDArray[np.float64], camera: str, size: int) -> NDArray[np.float64]:
-    """Pixel (x, y) of world points (N, 3) in a square image -> (N, 2); x to the right, y down; NaN for what is behind the camera."""
-    index = model.camera(CAMERA_NAMES.get(camera, camera)).id
+def project(model: Any, data: Any, points: NDArray[np.float64], index: int, size: int) -> NDArray[np.float64]:
+    """Pixel (x, y) of world points (N, 3) in a square image -> (N, 2); x to the right, y down; NaN for what is behind the camera.
+
+    Args:
+        index: of the camera in the model.
+    """
     seen = (points - data.cam_xpos[index]) @ data.cam_xmat[index].reshape(3, 3)
     depth = np.where(seen[:, 2] < 0.0, seen[:, 2], np.nan)  # a camera looks along its -z
     focal = size / 2 / np.tan(np.radians(model.cam_fovy[index]) / 2)

@@ -12,6 +12,7 @@ from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM, Observation
 from osel_sim.sim import predicates
 from osel_sim.sim.instance import Instance, make_instance
+from osel_sim.sim.robots import with_robot
 from osel_sim.sim.world import Snapshot, World
 
 WAITING = 0.0
@@ -36,6 +37,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         cameras: images that `reset` and `step` return; none by default, since an image costs more than a step. `observe` renders on demand.
         image_size: pixels, square.
         render_mode: `rgb_array` or None.
+        robot: name of the robot; None: the task's own.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 (gymnasium's own declaration)
@@ -50,6 +52,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         cameras: Sequence[str] = (),
         image_size: int = 96,
         render_mode: str | None = None,
+        robot: str | None = None,
     ) -> None:
         from osel_sim.sim.gl import choose_backend
 
@@ -60,6 +63,7 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
             task = load_task_file(content.find("tasks", task))
         from osel_sim.sim.cameras import Cameras
 
+        task = with_robot([task], robot)[0]
         self.task = task
         self.split, self.level, self.axes = split, level, dict(axes or {})
         self.cameras, self.image_size = tuple(cameras), image_size
@@ -155,13 +159,11 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         """Pixel (x, y) of world points (N, 3) in a square image of a camera -> (N, 2)."""
         from osel_sim.sim.cameras import project
 
-        return project(self.world.model, self.world.data, points, camera, size)
+        return project(self.world.model, self.world.data, points, self._camera(camera), size)
 
     def camera_pose(self, camera: str, relative_to_gripper: bool) -> dict[str, Any]:
         """Where a camera is (`osel_sim.training.projection.Pinhole` says what the entries mean)."""
-        from osel_sim.sim.scene import CAMERA_NAMES
-
-        index = self.world.model.camera(CAMERA_NAMES[camera]).id
+        index = self._camera(camera)
         position, rotation = self.world.data.cam_xpos[index], self.world.data.cam_xmat[index].reshape(3, 3)
         if relative_to_gripper:
             turn = self.world.grip_matrix.T
@@ -185,6 +187,10 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         subgoals = self.task.subgoals
         while self._reached < len(subgoals) and predicates.holds(self.world, subgoals[self._reached][1]):
             self._reached += 1
+
+    def _camera(self, camera: str) -> int:
+        """Index of a camera in the model."""
+        return int(self.world.model.camera(self.world.scene.cameras.get(camera, camera)).id)
 
     def _state(self) -> NDArray[np.float32]:
         world = self.world

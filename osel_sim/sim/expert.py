@@ -3,11 +3,10 @@
 Every skill is a function of the state alone, not of time, so that what it does can be learnt from observations.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.formats.terms import skills
 from osel_sim.sim import predicates
 from osel_sim.sim.scene import TABLE_HEIGHT
 from osel_sim.sim.world import World
@@ -73,7 +72,7 @@ class Expert:
                 self._stage = after
                 continue
             term = plan[self._stage]
-            action, done = _SKILLS[term.name](self, *(roles[role] for role in term.roles))
+            action, done = skills.load(term.name).act(self, *(roles[role] for role in term.roles))
             if not done:
                 return np.clip(action, -1.0, 1.0).astype(np.float32)
             self._stage += 1
@@ -91,14 +90,14 @@ class Expert:
         if float(np.linalg.norm(world.grasp_point(thing) - world.grip_position)) > 0.05:
             return self._again(thing)
         held = all(world.touches(finger, thing) for finger in ("left", "right"))
-        return self._towards(world.grasp_point(thing), self._grasp_yaw(thing), CLOSED, self._lean(thing)), held and world.gripper_command > 0.5
+        return self.towards(world.grasp_point(thing), self._grasp_yaw(thing), CLOSED, self._lean(thing)), held and world.gripper_command > 0.5
 
     def lift(self, thing: str) -> tuple[Array, bool]:
         """Straight up to travelling height."""
         if self._lost(thing):
             return self._again(thing)
         rise = TABLE_HEIGHT + TRAVEL - self.world.lowest_point(thing)
-        return self._towards(self.world.grip_position + np.array([0.0, 0.0, rise + 0.02]), 0.0, CLOSED), rise < 0.06
+        return self.towards(self.world.grip_position + np.array([0.0, 0.0, rise + 0.02]), 0.0, CLOSED), rise < 0.06
 
     def move(self, thing: str, place: str) -> tuple[Array, bool]:
         """Carry the thing over where it goes."""
@@ -106,7 +105,7 @@ class Expert:
             return self._again(thing)
         offset = self._spot(thing, place) - self.world.position(thing)
         offset[2] = TABLE_HEIGHT + TRAVEL - self.world.lowest_point(thing)
-        return self._towards(self.world.grip_position + offset, 0.0, CLOSED), float(np.hypot(offset[0], offset[1])) < 0.02
+        return self.towards(self.world.grip_position + offset, 0.0, CLOSED), float(np.hypot(offset[0], offset[1])) < 0.02
 
     def place(self, thing: str, place: str) -> tuple[Array, bool]:
         """Lower the thing to where it goes and let go; then up and away."""
@@ -117,15 +116,16 @@ class Expert:
         sideways = float(np.hypot(offset[0], offset[1]))
         if height < entity.floor + RELEASE + 0.006 and sideways < self._tolerance(place):
             if world.gripper_command > -0.5:
-                return self._towards(world.grip_position, 0.0, OPEN), False
+                return self.towards(world.grip_position, 0.0, OPEN), False
             above = world.highest_point(thing) + AWAY - float(world.grip_position[2])
-            return self._towards(world.grip_position + np.array([0.0, 0.0, above + 0.01]), 0.0, OPEN), above < 0.0
+            return self.towards(world.grip_position + np.array([0.0, 0.0, above + 0.01]), 0.0, OPEN), above < 0.0
         if self._lost(thing):
             return self._again(thing)
         offset[2] = entity.floor + RELEASE - height
         if entity.kind in FITTING and sideways > FIT:
             offset[2] = max(world.highest_point(place) + 0.015 - world.lowest_point(thing), offset[2])
-        return self._towards(world.grip_position + offset, 0.0, CLOSED), False
+        offset[2] = max(-world.robot.lowering / POSITION_GAIN, offset[2])
+        return self.towards(world.grip_position + offset, 0.0, CLOSED), False
 
     def push(self, thing: str, zone: str) -> tuple[Array, bool]:
         """Slide the thing along the table into the zone, between open fingers turned so that one of them is behind it."""
@@ -133,7 +133,7 @@ class Expert:
         way = (world.position(zone) - world.position(thing))[:2]
         distance = float(np.linalg.norm(way))
         if distance < 0.4 * world.task.entity(zone).inner:
-            return self._towards(world.grip_position + np.array([0.0, 0.0, 0.1]), self._turn(0.0), OPEN), not self._touched(thing)
+            return self.towards(world.grip_position + np.array([0.0, 0.0, 0.1]), self._turn(0.0), OPEN), not self._touched(thing)
         way = way / distance
         yaw = float(np.arctan2(-way[0], way[1]))
         yaw -= np.pi * np.round(yaw / np.pi)
@@ -142,7 +142,7 @@ class Expert:
         beside = off[:2] - float(off[:2] @ way) * way
         if float(np.hypot(off[0], off[1])) > 0.04 or abs(off[2]) > 0.02 or float(np.linalg.norm(beside)) > 0.02:
             return self._reach(thing, yaw)[0], False
-        action = self._towards(np.array([*world.grip_position[:2], point[2]]), yaw, OPEN)
+        action = self.towards(np.array([*world.grip_position[:2], point[2]]), yaw, OPEN)
         action[:2] = SHOVE_SPEED * way - POSITION_GAIN * beside
         return action, False
 
@@ -152,7 +152,7 @@ class Expert:
         if self._lost(thing):
             return self._again(thing)
         target = world.grasp_point(thing) + 0.035 * world.opening_direction(thing)
-        return self._towards(target, self._grasp_yaw(thing), CLOSED, self._lean(thing)), world.opening(thing) > 0.95
+        return self.towards(target, self._grasp_yaw(thing), CLOSED, self._lean(thing)), world.opening(thing) > 0.95
 
     def close(self, thing: str) -> tuple[Array, bool]:
         """Shove the handle back."""
@@ -167,7 +167,7 @@ class Expert:
         offset = target - world.grip_position
         sideways = float(np.hypot(offset[0], offset[1]))
         height = -0.03 if sideways < 0.012 else HOVER * min(1.0, sideways * 8.0)
-        return self._towards(target + np.array([0.0, 0.0, height]), 0.0, CLOSED), world.opening(button) > 0.9
+        return self.towards(target + np.array([0.0, 0.0, height]), 0.0, CLOSED), world.opening(button) > 0.9
 
     # -- helpers -------------------------------------------------------------------------------------------------------
 
@@ -177,25 +177,26 @@ class Expert:
         sideways = float(np.hypot(offset[0], offset[1]))
         done = sideways < 0.012 and abs(offset[2]) < 0.010
         if sideways > 0.02 and self._touched(thing):  # a finger is on it: let it go before it is dragged along
-            return self._towards(self.world.grip_position + np.array([0.0, 0.0, 0.1]), yaw, OPEN, self._lean(thing)), False
+            return self.towards(self.world.grip_position + np.array([0.0, 0.0, 0.1]), yaw, OPEN, self._lean(thing)), False
         # A funnel: the closer above the thing and the better turned, the lower.
         turn = abs(self._turn(yaw))
         height = float(np.clip(max((sideways - 0.010) * 4.0, (turn - 0.10) * 4.0), 0.0, 1.0)) * HOVER
         if sideways > 0.06:
             height = max(HOVER, TABLE_HEIGHT + 0.20 - target[2])
-        return self._towards(target + np.array([0.0, 0.0, height]), yaw, OPEN, self._lean(thing)), done
+        return self.towards(target + np.array([0.0, 0.0, height]), yaw, OPEN, self._lean(thing)), done
 
     def _achieved(self) -> int | None:
         """The stage to go on with if what begins at this one has been achieved already."""
         plan, roles = self.world.task.plan, self.world.instance.roles
-        if self._stage and plan[self._stage - 1].name not in _ACHIEVED:
+        if self._stage and skills.load(plan[self._stage - 1].name).achieved is None:
             return None  # in the midst of it
         for stage in range(self._stage, len(plan)):
-            if test := _ACHIEVED.get(plan[stage].name):
+            if test := skills.load(plan[stage].name).achieved:
                 return stage + 1 if test(self, *(roles[role] for role in plan[stage].roles)) else None
         return None
 
-    def _put(self, thing: str, place: str) -> bool:
+    def has_put(self, thing: str, place: str) -> bool:
+        """Whether the thing is where it goes, and let go."""
         is_object = self.world.task.entity(place).kind == "object"
         return not self._touched(thing) and (predicates.on if is_object else predicates.inside)(self.world, thing, place)
 
@@ -241,18 +242,21 @@ class Expert:
         beside = relative - along * way
         if abs(float(grip[2] - point[2])) < 0.03 and along < 0.0 and float(np.linalg.norm(beside)) < 0.025:
             # Not down as well: fingers that press what they shove against the table hardly move it.
-            action = self._towards(np.array([*grip[:2], max(float(grip[2]), point[2])]), 0.0, CLOSED)
+            action = self.towards(np.array([*grip[:2], max(float(grip[2]), point[2])]), 0.0, CLOSED)
             action[:2] = SHOVE_SPEED * way - POSITION_GAIN * beside  # back onto the line as it goes: what is shoved from beside it turns away
             return action
         behind = point[:2] - room * way
         there = float(np.linalg.norm(grip[:2] - behind)) < 0.012
         height = point[2] if there else point[2] + 0.12
         if not there and grip[2] < point[2] + 0.08:
-            return self._towards(np.array([*grip[:2], height]), 0.0, CLOSED)  # straight up first
-        return self._towards(np.array([*behind, height]), 0.0, CLOSED)
+            return self.towards(np.array([*grip[:2], height]), 0.0, CLOSED)  # straight up first
+        return self.towards(np.array([*behind, height]), 0.0, CLOSED)
 
     def _lean(self, thing: str) -> Array:
-        """Rotation (3, 3) by which a gripper that holds the thing leans away from what its handle is fixed to."""
+        """Rotation (3, 3) by which a gripper that holds the thing leans away from what its handle is fixed to.
+
+        Rodrigues' formula: scipy's Rotation differs in the last bits, and with them the episodes of the expert would.
+        """
         angle = np.radians(self.world.task.entity(thing).lean)
         if not angle:
             return np.eye(3)
@@ -278,8 +282,15 @@ class Expert:
         matrix = self.world.grip_matrix
         return float(np.arctan2(-matrix[0, 0], matrix[1, 0]) - yaw)
 
-    def _towards(self, position: Array, yaw: float, gripper: float, lean: Array | None = None) -> Array:
-        """Action towards a position, gripper pointing down and turned by `yaw`, then leaning."""
+    def towards(self, position: Array, yaw: float, gripper: float, lean: Array | None = None) -> Array:
+        """Action (7,) towards a position of the grip site, gripper pointing down and turned by `yaw`, then leaning.
+
+        Args:
+            position: (3,), metres, world.
+            yaw: radians about the vertical.
+            gripper: `OPEN` or `CLOSED`.
+            lean: rotation (3, 3) applied last.
+        """
         action = np.empty(7)
         step = POSITION_GAIN * (position - self.world.grip_position)
         action[:3] = step / max(1.0, float(np.abs(step).max()))  # a straight line, also where the limit of 1 cuts in
@@ -293,25 +304,3 @@ class Expert:
         action[3:6] = 0.5 * ROTATION_GAIN * np.array([error[1, 2], error[2, 0], error[0, 1]])
         action[6] = gripper
         return action
-
-
-_SKILLS: dict[str, Callable[..., tuple[Array, bool]]] = {
-    "reach": Expert.reach,
-    "grasp": Expert.grasp,
-    "lift": Expert.lift,
-    "move": Expert.move,
-    "place": Expert.place,
-    "push": Expert.push,
-    "open": Expert.open,
-    "close": Expert.close,
-    "press": Expert.press,
-}
-
-_ACHIEVED: dict[str, Callable[..., bool]] = {
-    "place": Expert._put,
-    "push": Expert._put,
-    "open": lambda expert, thing: predicates.opened(expert.world, thing),
-    "close": lambda expert, thing: predicates.closed(expert.world, thing),
-    "press": lambda expert, thing: predicates.pressed(expert.world, thing),
-}
-"""How to tell that what a skill is for has been reached."""

@@ -1,4 +1,4 @@
-"""An instance: one scene with one instruction, fixed bit for bit by (task, seed, level, axes, split)."""
+"""An instance: one scene with one instruction, fixed bit for bit by (task, seed, level, axes, split) and by the robot that does it."""
 
 import hashlib
 import math
@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from osel_sim.core.errors import UsageError
-from osel_sim.formats.levels import label, resolve, split_off
+from osel_sim.formats.levels import instance_key, label, resolve, split_off
 from osel_sim.formats.task_file import ATTRIBUTE, Entity, TaskSpec
+from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.sim.perturbation import CLEAN, HELD_OUT, MORE_DISTRACTORS, Perturbation, draw, widen
+from osel_sim.sim.robots import load_robot
 
 SPLITS = ("train", "validation", "test")
 GAP = 0.035
@@ -42,6 +44,7 @@ class Instance:
         named: how many of the roles the instruction names, the first ones.
         level, axes: how far it is perturbed, as `osel_sim.formats.levels.split_off` has it.
         perturbation: what it looks like.
+        robot: name of the robot. Another one finds the same scene with the same instruction.
     """
 
     task: str
@@ -55,11 +58,17 @@ class Instance:
     named: int = 2
     axes: str | None = None
     perturbation: Perturbation = CLEAN
+    robot: str = DEFAULT_ROBOT
 
     @property
     def key(self) -> str:
         """Name of the instance, unique over all."""
-        return f"{self.task}/{self.split}/{label(self.level, self.axes)}/{self.seed}"
+        return instance_key(self.task, self.split, label(self.level, self.axes), self.seed, self.robot)
+
+    @property
+    def other_robot(self) -> str | None:
+        """Name of the robot, None where it is the usual one: as journals and logs have it."""
+        return None if self.robot == DEFAULT_ROBOT else self.robot
 
     @property
     def target(self) -> str:
@@ -85,13 +94,14 @@ def make_instance(task: TaskSpec, seed: int, level: int = 0, split: str = "test"
         axes: axis -> level, where it differs from `level`.
 
     Raises:
-        UsageError: an unknown split, level or axis, an axis that the task does not allow, a negative seed.
+        UsageError: an unknown split, level, axis or robot, an axis that the task does not allow, a negative seed.
     """
     if split not in SPLITS:
         raise UsageError(f"unknown split {split!r}, known: {', '.join(SPLITS)}")
     levels = resolve(level, axes, task.axes, task.name)
     if seed < 0:
         raise UsageError(f"a seed must be 0 or more, got {seed}")
+    robot = load_robot(task.robot)
     scene = [_number(task.name), SPLITS.index(split), 0, seed]
     rng = np.random.default_rng(scene)
 
@@ -127,7 +137,8 @@ def make_instance(task: TaskSpec, seed: int, level: int = 0, split: str = "test"
         placements=tuple(placements),
         named=len(task.roles),
         axes=above,
-        perturbation=draw(levels, [entity.name for entity in task.entities], [entity.name for entity in task.of_kind("object")], stream),
+        perturbation=draw(levels, [entity.name for entity in task.entities], [entity.name for entity in task.of_kind("object")], robot, stream),
+        robot=robot.name,
     )
 
 

@@ -1,26 +1,26 @@
-"""Light visual meshes: robosuite's Panda has 180,000 mesh faces, of which a 96-pixel image shows none of the finish, and its floor 2,304 squares.
+"""Light visual meshes: robosuite's arms have 130,000 to 180,000 mesh faces, of whose finish a 96-pixel image shows none, and its floor 2,304 squares.
 
-Decimated once with fast-simplification and kept in the user's cache folder. Only meshes no colliding geom uses are touched, so the physics is the
-same to the last bit.
+Decimated once with fast-simplification and kept in the user's cache folder. Meshes that a colliding geom uses stay as they are, so the physics is the
+same to the last bit; where a robot shows such a mesh as well, what it shows becomes a mesh of its own.
 """
 
 import hashlib
 import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-KEEP = 0.04
-"""Fraction of faces kept."""
-FEWEST = 250
-"""Meshes with no more faces than this stay as they are."""
-MOST = 600
-"""Meshes with more faces than this after decimation are welded more coarsely first: those made of thousands of loose pieces do not decimate."""
-JOIN = 0.06
-"""Metres, four pixels of the robot's pedestal: corners this close become one where a mesh is in pieces."""
+from osel_sim.core.arrays import read_arrays
+from osel_sim.core.errors import DataError
+from osel_sim.core.files import atomic
+from osel_sim.interface.robot import LightMeshes
+
+ROBOT = ("robot0_", "gripper0_", "fixed_mount0_")
+"""How the names of a robot's meshes begin."""
+SHOWN = "_shown"
+"""How the name of a light mesh ends that is there beside the colliding one."""
 
 
 def cache_folder() -> Path:
@@ -29,65 +29,74 @@ def cache_folder() -> Path:
     return Path(base) / "osel_sim"
 
 
-def lighten(spec: Any, xml: str) -> None:
+def lighten(spec: Any, xml: str, how: LightMeshes) -> None:
     """Replace the heavy purely visual meshes of a `mujoco.MjSpec` by light ones.
 
     Args:
         spec: the spec to change in place, not compiled yet.
         xml: the MJCF text it was made of.
+        how: far.
     """
     import mujoco
     import robosuite
 
-    made_of = f"{KEEP} {FEWEST} {MOST} {JOIN} {mujoco.__version__} {robosuite.__version__} {xml}"
+    made_of = f"{how.keep} {how.fewest} {how.most} {how.join} {mujoco.__version__} {robosuite.__version__} {SHOWN} {xml}"
     file = cache_folder() / f"light_meshes_{hashlib.sha256(made_of.encode()).hexdigest()[:16]}.npz"
     light = _load(file)
     if light is None:
-        light = _make(mujoco.MjModel.from_xml_string(xml))
+        light = _make(mujoco.MjModel.from_xml_string(xml), how)
         _save(file, light)
-    for mesh in spec.meshes:
-        if f"{mesh.name}.vertices" in light:
-            # Given by vertices instead of a file; the file's scale is in them already.
-            mesh.file = ""
-            mesh.scale, mesh.refpos, mesh.refquat = [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]
-            mesh.uservert = light[f"{mesh.name}.vertices"].ravel()
-            mesh.userface = light[f"{mesh.name}.faces"].ravel()
+    for name in [key.removesuffix(".vertices") for key in light if key.endswith(".vertices")]:
+        mesh = spec.mesh(name) or spec.add_mesh(name=name)
+        # Given by vertices instead of a file; the file's scale is in them already.
+        mesh.file = ""
+        mesh.scale, mesh.refpos, mesh.refquat = [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]
+        mesh.uservert = light[f"{name}.vertices"].ravel()
+        mesh.userface = light[f"{name}.faces"].ravel()
     for geom in spec.geoms:
+        if f"{geom.meshname}{SHOWN}.vertices" in light and not geom.contype and not geom.conaffinity:
+            geom.meshname += SHOWN
         if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
             # The third size is only how finely a plane is divided for light that falls off, which robosuite's does not: its floor has 2,304 squares.
             geom.size[2] = max(geom.size[0], geom.size[1], geom.size[2])
 
 
-def _make(model: Any) -> dict[str, NDArray[Any]]:
+def _make(model: Any, how: LightMeshes) -> dict[str, NDArray[Any]]:
     import fast_simplification
 
     light: dict[str, NDArray[Any]] = {}
-    for i in _heavy(model):
+    for i, name in _heavy(model, how.fewest).items():
         vertices, faces = _weld(_vertices(model, i), _faces(model, i))
-        target = min(max(FEWEST, int(len(faces) * KEEP)), MOST)
+        target = min(max(how.fewest, int(len(faces) * how.keep)), how.most)
         points, triangles = fast_simplification.simplify(vertices.astype(np.float32), faces, target_count=target)
-        if len(triangles) > MOST:
+        for cell in how.join:
+            if len(triangles) <= how.most:
+                break
             # Made of loose pieces, which no decimation joins.
-            points, triangles = fast_simplification.simplify(*_join(vertices, faces), target_count=target)
+            points, triangles = _join(vertices, faces, cell)
+            if len(triangles) > target:
+                points, triangles = fast_simplification.simplify(points, triangles, target_count=target)
         if len(triangles) >= 4:
-            light[f"{model.mesh(i).name}.vertices"] = points.astype(np.float32)
-            light[f"{model.mesh(i).name}.faces"] = triangles.astype(np.int32)
+            light[f"{name}.vertices"] = points.astype(np.float32)
+            light[f"{name}.faces"] = triangles.astype(np.int32)
     return light
 
 
-def _heavy(model: Any) -> list[int]:
-    """Meshes with many faces that no colliding geom and none with a flat texture uses."""
+def _heavy(model: Any, fewest: int) -> dict[int, str]:
+    """Meshes with many faces that geoms show, none of them with a flat texture -> name of the light one: its own where no geom collides with it."""
     import mujoco
 
-    keep = set()
+    shown, colliding, textured = set[int](), set[int](), set[int]()
     for geom in range(model.ngeom):
         material = model.geom_matid[geom]
         textures = model.mat_texid[material] if material >= 0 else np.array([-1])
         # Flat textures need the mesh's own coordinates, which decimation loses; cube textures do without.
-        flat = any(model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D for texture in textures[textures >= 0])
-        if flat or model.geom_contype[geom] or model.geom_conaffinity[geom]:
-            keep.add(int(model.geom_dataid[geom]))
-    return [i for i in range(model.nmesh) if i not in keep and model.mesh_facenum[i] > FEWEST]
+        if any(model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D for texture in textures[textures >= 0]):
+            textured.add(int(model.geom_dataid[geom]))
+        (colliding if model.geom_contype[geom] or model.geom_conaffinity[geom] else shown).add(int(model.geom_dataid[geom]))
+    names = {i: model.mesh(i).name for i in range(model.nmesh) if i not in textured and model.mesh_facenum[i] > fewest}
+    beside = {i: name + SHOWN for i, name in names.items() if i in shown & colliding and name.startswith(ROBOT)}
+    return {i: name for i, name in names.items() if i not in colliding} | beside
 
 
 def _vertices(model: Any, i: int) -> NDArray[np.float64]:
@@ -113,9 +122,9 @@ def _weld(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDAr
     return unique, _proper(inverse.reshape(-1)[faces])
 
 
-def _join(vertices: NDArray[np.float64], faces: NDArray[np.int32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+def _join(vertices: NDArray[np.float64], faces: NDArray[np.int32], cell: float) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Merge the vertices within each cell of a grid into the first of them, and faces that then coincide."""
-    _, first, inverse = np.unique((vertices / JOIN).round(), axis=0, return_index=True, return_inverse=True)
+    _, first, inverse = np.unique((vertices / cell).round(), axis=0, return_index=True, return_inverse=True)
     joined = _proper(inverse.reshape(-1)[faces])
     _, once = np.unique(np.sort(joined, axis=1), axis=0, return_index=True)
     return vertices[first].astype(np.float32), joined[once]
@@ -129,14 +138,12 @@ def _proper(faces: NDArray[Any]) -> NDArray[np.int32]:
 
 def _save(file: Path, light: dict[str, NDArray[Any]]) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as handle:
+    with atomic(file, shared=True) as partial, partial.open("wb") as handle:
         np.savez(handle, **light)  # type: ignore[arg-type]
-    os.replace(handle.name, file)  # atomic: several processes may make it at once, with the same bytes
 
 
 def _load(file: Path) -> dict[str, NDArray[Any]] | None:
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            return dict(archive)
-    except (OSError, ValueError, EOFError):  # missing, or torn by a crash: make it anew
+        return read_arrays(file, "meshes")
+    except DataError:  # missing, or torn by a crash: make it anew
         return None

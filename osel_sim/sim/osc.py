@@ -1,6 +1,6 @@
-"""robosuite's OSC_POSE for the Panda, compiled.
+"""robosuite's OSC_POSE, compiled, for an arm of n joints.
 
-Same torques as `robosuite.controllers.parts.arm.osc.OperationalSpaceController` with the Panda's default settings (fixed impedance, delta
+Same torques as `robosuite.controllers.parts.arm.osc.OperationalSpaceController` with robosuite's default settings (fixed impedance, delta
 input in the base frame, position and orientation uncoupled, null space towards the initial joints). robosuite inverts the mass matrix and takes
 three pseudo-inverses a substep; all of them are of symmetric positive definite matrices, so Cholesky solves give the same numbers for a fraction
 of the time (Khatib 1987 for the method).
@@ -11,13 +11,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
-KP = 150.0
-KD = 2.0 * np.sqrt(150.0)
-NULL_KP = 10.0
-NULL_KD = 2.0 * np.sqrt(10.0)
-OUTPUT_MAX = np.array([0.05, 0.05, 0.05, 0.5, 0.5, 0.5])
-"""What an action of 1 means: metres and radians a control step."""
 
 
 @njit(cache=True)
@@ -41,11 +34,11 @@ def _rotation(vector: Array) -> Array:
 
 
 @njit(cache=True)
-def goal_pose(action: Array, position: Array, matrix: Array, base_position: Array, base_matrix: Array) -> tuple[Array, Array]:
-    """World goal (3,), (3, 3) of a delta action (6,) in [-1, 1], relative to the pose reached."""
+def goal_pose(action: Array, output_max: Array, position: Array, matrix: Array, base_matrix: Array) -> tuple[Array, Array]:
+    """World goal (3,), (3, 3) of a delta action (6,) in [-1, 1], relative to the pose reached; `output_max` (6,) is what 1 means."""
     delta = np.empty(6)
     for i in range(6):
-        delta[i] = min(max(action[i], -1.0), 1.0) * OUTPUT_MAX[i]
+        delta[i] = min(max(action[i], -1.0), 1.0) * output_max[i]
     goal_position = position + base_matrix @ delta[:3]
     rotation = _rotation(delta[3:])
     goal_matrix = base_matrix @ (rotation @ (base_matrix.T @ matrix))
@@ -112,37 +105,42 @@ def osc_torques(
     joint_velocity: Array,
     bias: Array,
     initial_joint: Array,
+    gains: tuple[float, float, float, float],
 ) -> Array:
-    """Joint torques (7,), before the actuators' limits.
+    """Joint torques (n,), before the actuators' limits.
 
     Args:
         position, matrix: pose of the grip site in the world, (3,) and (9,).
         jacobian_position, jacobian_rotation: of the grip site, (3, nv) each; the arm's degrees of freedom come first.
-        inertia: MuJoCo's `qM`; `addresses` (7, 7) says where the arm's entries lie in it.
-        bias: gravity, centrifugal and Coriolis torques (at least 7,).
+        inertia: MuJoCo's `qM`; `addresses` (n, n) says where the arm's entries lie in it.
+        bias: gravity, centrifugal and Coriolis torques (at least n,).
+        initial_joint: posture (n,) that the null space pulls towards.
+        gains: stiffness and damping of the pose, then of the null space.
     """
-    jacobian = np.empty((6, 7))
-    jacobian[:3] = jacobian_position[:, :7]
-    jacobian[3:] = jacobian_rotation[:, :7]
-    mass = np.empty((7, 7))
-    for i in range(7):
-        for j in range(7):
+    n = initial_joint.shape[0]
+    kp, kd, null_kp, null_kd = gains
+    jacobian = np.empty((6, n))
+    jacobian[:3] = jacobian_position[:, :n]
+    jacobian[3:] = jacobian_rotation[:, :n]
+    mass = np.empty((n, n))
+    for i in range(n):
+        for j in range(n):
             mass[i, j] = inertia[addresses[i, j]]
 
-    velocity = jacobian @ joint_velocity[:7]
+    velocity = jacobian @ joint_velocity[:n]
     current = matrix.reshape(3, 3)
     force = np.empty(3)
     torque = np.zeros(3)
     for i in range(3):
-        force[i] = KP * (goal_position[i] - position[i]) - KD * velocity[i]
+        force[i] = kp * (goal_position[i] - position[i]) - kd * velocity[i]
         a, b = (i + 1) % 3, (i + 2) % 3
         for k in range(3):
             torque[i] += 0.5 * (current[a, k] * goal_matrix[b, k] - current[b, k] * goal_matrix[a, k])
-        torque[i] = KP * torque[i] - KD * velocity[3 + i]
+        torque[i] = kp * torque[i] - kd * velocity[3 + i]
 
     factor = mass.copy()
     _cholesky(factor)
-    solved = np.empty((6, 7))  # J M^-1
+    solved = np.empty((6, n))  # J M^-1
     for i in range(6):
         row = jacobian[i].copy()
         _solve(factor, row)
@@ -152,7 +150,7 @@ def osc_torques(
     wrench[:3] = _apply_inverse(mobility[:3, :3].copy(), force)
     wrench[3:] = _apply_inverse(mobility[3:, 3:].copy(), torque)
 
-    posture = mass @ (NULL_KP * (initial_joint - joint_position[:7]) - NULL_KD * joint_velocity[:7])
+    posture = mass @ (null_kp * (initial_joint - joint_position[:n]) - null_kd * joint_velocity[:n])
     hidden = _apply_inverse(mobility, solved @ posture)
-    torques: Array = jacobian.T @ (wrench - hidden) + posture + bias[:7]
+    torques: Array = jacobian.T @ (wrench - hidden) + posture + bias[:n]
     return torques

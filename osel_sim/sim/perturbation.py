@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from osel_sim.formats.task_file import Region
+from osel_sim.interface.robot import Robot
 
 type Triple = tuple[float, float, float]
 type Stream = Callable[[str], np.random.Generator]
@@ -51,7 +52,7 @@ class Perturbation:
         table_tint: factors of its red, green and blue.
         tints: thing -> (paleness, red, green, blue): so much white is mixed in, then colours are multiplied.
         sizes: object -> factor.
-        joints: radians added to the robot's seven start joints.
+        joints: radians added to the robot's start joints; empty where it starts as it always does.
     """
 
     lamp: Triple = (1.0, 1.0, 1.0)
@@ -63,7 +64,7 @@ class Perturbation:
     table_tint: Triple = (1.0, 1.0, 1.0)
     tints: tuple[tuple[str, tuple[float, ...]], ...] = ()
     sizes: tuple[tuple[str, float], ...] = ()
-    joints: tuple[float, ...] = (0.0,) * 7
+    joints: tuple[float, ...] = ()
 
 
 CLEAN = Perturbation()
@@ -87,10 +88,6 @@ TINT = (0.0, 0.10, 0.22, 0.40)
 SIZE = (0.0, 0.06, 0.12, 0.18)
 """The widest object is 6 cm across where it is grasped, the open gripper 8 cm."""
 JOINTS = (0.0, 0.03, 0.07, 0.12)
-JOINT_WEIGHTS = np.array([1.0, 1.0, 1.0, 1.0, 1.5, 1.5, 2.0])
-"""The wrist's joints move the hand less."""
-LIFT = np.array([0.0, -0.457, 0.0, 0.315, 0.0, 0.113, 0.0])
-"""Metres a radian by which each joint lifts the hand at its start pose."""
 WIDER = (0.0, 0.10, 0.20, 0.30)
 """Share of a start region's extent, or of a range of turns, by which each side moves out, ..."""
 REACH_X, REACH_Y = (-0.18, 0.18), (-0.28, 0.28)
@@ -100,7 +97,7 @@ HELD_OUT = (0.0, 1 / 3, 2 / 3, 1.0)
 """Chance that a training phrasing of a test instance gives way to a held-out one. Half of them are held out to begin with."""
 
 
-def draw(levels: Mapping[str, int], things: Sequence[str], objects: Sequence[str], stream: Stream) -> Perturbation:
+def draw(levels: Mapping[str, int], things: Sequence[str], objects: Sequence[str], robot: Robot, stream: Stream) -> Perturbation:
     """The appearance of one instance.
 
     Args:
@@ -122,7 +119,7 @@ def draw(levels: Mapping[str, int], things: Sequence[str], objects: Sequence[str
         rng = stream("sizes")
         parts["sizes"] = tuple((name, 1.0 + _either(rng, SIZE[level])) for name in objects)
     if level := levels.get("robot", 0):
-        parts["joints"] = _joints(level, stream("robot"))
+        parts["joints"] = _joints(level, robot, stream("robot"))
     return dataclasses.replace(CLEAN, **parts)  # type: ignore[arg-type]
 
 
@@ -170,9 +167,9 @@ def _tint(level: int, rng: np.random.Generator) -> tuple[float, ...]:
     return (paleness, *(brightness * (1.0 - float(rng.uniform(0.0, TINT[level] / 3))) for _ in range(3)))
 
 
-def _joints(level: int, rng: np.random.Generator) -> tuple[float, ...]:
-    offsets = np.array([_either(rng, JOINTS[level]) for _ in range(7)]) * JOINT_WEIGHTS
-    if LIFT @ offsets < 0:  # the hand starts a hand's breadth above the tallest things: it may start higher, not lower
+def _joints(level: int, robot: Robot, rng: np.random.Generator) -> tuple[float, ...]:
+    offsets = np.array([_either(rng, JOINTS[level]) for _ in range(robot.joints)]) * robot.start_weights
+    if np.array(robot.start_lift) @ offsets < 0:  # the hand starts a hand's breadth above the tallest things: it may start higher, not lower
         offsets = -offsets
     return tuple(float(offset) for offset in offsets)
 

@@ -1,20 +1,21 @@
-"""The MuJoCo model of a task: robosuite's Panda, arena and objects, with everything the task may use in one model.
+"""The MuJoCo model of a task: a robot, arena and objects of robosuite, with everything the task may use in one model.
 
 An instance only moves things (and parks those it does not use out of sight), so nothing is compiled again between episodes.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError
 from osel_sim.formats.task_file import Entity
+from osel_sim.interface.robot import Robot
 
 TABLE_HEIGHT = 0.8
 TABLE_SIZE = (0.8, 0.8, 0.05)
-CAMERA_NAMES = {"agentview": "agentview", "wrist": "robot0_eye_in_hand"}
 AGENTVIEW_POSITION = (0.66, 0.0, 1.55)
 AGENTVIEW_TARGET = (-0.02, 0.0, 0.85)
 AGENTVIEW_FOVY = 41.0
@@ -28,21 +29,22 @@ class Scene:
     Attributes:
         model: `mujoco.MjModel` with light visual meshes; all physics and fast images use it.
         root_bodies: thing -> name of its top body.
+        cameras: `agentview` and `wrist` -> their names in the model.
     """
 
     model: Any
     xml: str
     root_bodies: dict[str, str]
-    initial_qpos: tuple[float, ...]
+    cameras: Mapping[str, str]
 
 
-def build_scene(entities: Sequence[Entity]) -> Scene:
+def build_scene(entities: Sequence[Entity], robot: Robot) -> Scene:
     """Compile the scene with light meshes (cached within the process)."""
-    return _build(tuple(entities))
+    return _build(tuple(entities), robot)
 
 
 @functools.lru_cache(maxsize=8)
-def _build(entities: tuple[Entity, ...]) -> Scene:
+def _build(entities: tuple[Entity, ...], robot: Robot) -> Scene:
     import mujoco
 
     from osel_sim.sim.gl import quiet_robosuite
@@ -50,11 +52,11 @@ def _build(entities: tuple[Entity, ...]) -> Scene:
     from osel_sim.sim.table_tops import add_tables
 
     quiet_robosuite()
-    xml, root_bodies, initial_qpos = _compose(entities)
+    xml, root_bodies = _compose(entities, robot)
     spec = mujoco.MjSpec.from_string(xml)
-    lighten(spec, xml)
+    lighten(spec, xml, robot.meshes)
     add_tables(spec)
-    return Scene(spec.compile(), xml, root_bodies, initial_qpos)
+    return Scene(spec.compile(), xml, root_bodies, {"agentview": "agentview", "wrist": robot.wrist_camera.name})
 
 
 def full_model(xml: str) -> Any:
@@ -68,26 +70,44 @@ def full_model(xml: str) -> Any:
     return spec.compile()
 
 
-def _compose(entities: tuple[Entity, ...]) -> tuple[str, dict[str, str], tuple[float, ...]]:
+def _compose(entities: tuple[Entity, ...], robot: Robot) -> tuple[str, dict[str, str]]:
     """The scene as MJCF text, made of robosuite's parts as its own environments do it."""
     from robosuite.models.arenas import TableArena
     from robosuite.models.bases import robot_base_factory
-    from robosuite.models.grippers import gripper_factory
-    from robosuite.models.robots import Panda
     from robosuite.models.tasks import ManipulationTask
 
-    robot = Panda(idn=0)
-    robot.add_base(robot_base_factory(robot.default_base, idn=0))
-    robot.add_gripper(gripper_factory("PandaGripper", idn="0_right"), robot.eef_name["right"])
-    robot.set_base_xpos(robot.base_xpos_offset["table"](TABLE_SIZE[0]))
+    arm = _attribute(robot.model)(idn=0)
+    arm.add_base(robot_base_factory(arm.default_base, idn=0))
+    gripper = _attribute(robot.gripper.model)(idn="0_right")
+    if robot.gripper.prepare is not None:
+        robot.gripper.prepare(gripper)
+    arm.add_gripper(gripper, arm.eef_name["right"])
+    x, y, z = arm.base_xpos_offset["table"](TABLE_SIZE[0])
+    arm.set_base_xpos((x + robot.nearer, y, z))
+    _mount_camera(arm, robot)
     arena = TableArena(table_full_size=TABLE_SIZE, table_offset=(0, 0, TABLE_HEIGHT))
     arena.set_origin([0, 0, 0])
     arena.table_visual.set("rgba", TABLE_COLOUR)  # the white plate would vanish on robosuite's white table
     quaternion = _look_at(AGENTVIEW_POSITION, AGENTVIEW_TARGET)
     arena.set_camera("agentview", pos=AGENTVIEW_POSITION, quat=quaternion, camera_attribs={"fovy": str(AGENTVIEW_FOVY)})
     objects = {entity.name: _make_object(entity) for entity in entities}
-    task = ManipulationTask(mujoco_arena=arena, mujoco_robots=[robot], mujoco_objects=list(objects.values()))
-    return task.get_xml(), {name: thing.root_body for name, thing in objects.items()}, tuple(float(q) for q in robot.init_qpos)
+    task = ManipulationTask(mujoco_arena=arena, mujoco_robots=[arm], mujoco_objects=list(objects.values()))
+    return task.get_xml(), {name: thing.root_body for name, thing in objects.items()}
+
+
+def _attribute(location: str) -> Any:
+    """What `module:name` names."""
+    module, _, name = location.partition(":")
+    return getattr(import_module(module), name)
+
+
+def _mount_camera(arm: Any, robot: Robot) -> None:
+    """Move the wrist camera to where the robot's file has it."""
+    mount = robot.wrist_camera
+    camera = next(camera for camera in arm.root.iter("camera") if camera.get("name") == mount.name)
+    for key, value in (("pos", mount.position), ("quat", mount.quaternion)):
+        if value is not None:
+            camera.set(key, " ".join(map(str, value)))
 
 
 def _make_object(entity: Entity) -> Any:

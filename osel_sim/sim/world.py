@@ -7,18 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.core.errors import ContentError
+from osel_sim.core.errors import ContentError, UsageError
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.sim.appearance import Appearance
 from osel_sim.sim.control import Control
 from osel_sim.sim.instance import Instance
+from osel_sim.sim.robots import load_robot
 from osel_sim.sim.scene import TABLE_HEIGHT, build_scene
 
 Array = NDArray[np.float64]
 
 SETTLE_STEPS = 4
 """Control steps a new scene is given to come to rest."""
-GRIPPER_OPEN = (0.04, -0.04)
 PARKED = -3.0
 """Height at which things that are not in the scene hang, under the floor."""
 
@@ -28,28 +28,28 @@ class Snapshot:
     """Everything that the future of a world depends on."""
 
     physics: Array
-    gripper_command: Array
+    gripper_command: float
     instance: Instance
 
 
 class World:
-    """One task's MuJoCo world. `load` an instance, then `step`."""
+    """One task's MuJoCo world, with the robot that the task names. `load` an instance, then `step`."""
 
     def __init__(self, task: TaskSpec) -> None:
         import mujoco
 
         self._mujoco = mujoco
-        self.task = task
-        self.scene = build_scene(task.entities)
+        self.task, self.robot = task, load_robot(task.robot)
+        self.scene = build_scene(task.entities, self.robot)
         # Containers are moved through the model, so every world needs its own.
         self.model = mujoco.MjModel.__copy__(self.scene.model)
         self.data = mujoco.MjData(self.model)
         self.instance: Instance = None  # type: ignore[assignment]  # until the first load()
-        self._initial_joint = np.array(self.scene.initial_qpos)
-        self._control = Control(self.model, self.data, self._initial_joint)
+        self._home = np.array(self.robot.home)
+        self._control = Control(self.model, self.data, self.robot, self._home)
         self._start_heights: dict[str, float] = {}
         self._find()
-        self.appearance = Appearance(self.model, self.scene.root_bodies)
+        self.appearance = Appearance(self.model, self.scene.root_bodies, self.scene.cameras)
 
     # -- what is where -------------------------------------------------------------------------------------------------
 
@@ -69,7 +69,8 @@ class World:
         """Orientation of the grip site as axis-angle (3,), radians.
 
         A gripper that points down is half a turn away from the identity, where axis-angle jumps between v and -v. Of the two quaternions that mean
-        the same, the one with a positive x is taken, and angles run up to a whole turn, so that the jump is far from where the robot works.
+        the same, the one with a positive x is taken, and angles run up to a whole turn, so that the jump is far from where the robot works;
+        scipy's Rotation stops at half a turn.
         """
         quaternion = np.empty(4)
         self._mujoco.mju_mat2Quat(quaternion, self._control.matrix)
@@ -81,14 +82,19 @@ class World:
 
     @property
     def finger_positions(self) -> Array:
-        """Two finger joints (2,), metres: about (0.04, -0.04) open, (0, 0) closed."""
-        positions: Array = self.data.qpos[7:9]
-        return positions
+        """How far each finger is from the middle (2,), metres, the second as a negative number: about (0.04, -0.04) open, (0, 0) closed."""
+        if not self._pads:
+            arm = self.robot.joints
+            positions: Array = self.data.qpos[arm : arm + 2]
+            return positions
+        across = self.grip_matrix[:, 0]
+        apart = [side * float(across @ (self.data.geom_xpos[pad] - self.grip_position)) - half for pad, side, half in self._pads]
+        return np.array([apart[0], -apart[1]])
 
     @property
     def gripper_command(self) -> float:
         """How far the gripper was told to close, -1 (open) to 1 (closed)."""
-        return float(self._control.gripper_command[1])
+        return self._control.gripper_command
 
     def position(self, thing: str) -> Array:
         """Origin of a thing in the world (3,), metres."""
@@ -173,13 +179,19 @@ class World:
     # -- changing it ---------------------------------------------------------------------------------------------------
 
     def load(self, instance: Instance) -> None:
-        """Reset to an instance: poses and looks only, no compilation."""
-        mujoco, model, data = self._mujoco, self.model, self.data
+        """Reset to an instance: poses and looks only, no compilation.
+
+        Raises:
+            UsageError: it is another robot's.
+        """
+        if instance.robot != self.robot.name:
+            raise UsageError(f"{instance.key} is for the robot {instance.robot}, this world has {self.robot.name}")
+        mujoco, model, data, arm = self._mujoco, self.model, self.data, self.robot.joints
         mujoco.mj_resetData(model, data)
         self.appearance.apply(instance.perturbation)
-        data.qpos[:7] = self._initial_joint + instance.perturbation.joints  # the null space still pulls towards the unperturbed posture
-        data.qpos[7:9] = GRIPPER_OPEN
-        self._control.gripper_command[:] = 0.0
+        data.qpos[:arm] = self._home + (instance.perturbation.joints or 0.0)  # the null space still pulls towards the unperturbed posture
+        data.qpos[arm : arm + len(self.robot.gripper.rest)] = self.robot.gripper.rest
+        self._control.gripper_command = 0.0
         self.instance = instance
         present = {placement.entity: placement for placement in instance.placements}
         self._set_present(present)
@@ -207,14 +219,14 @@ class World:
         spec = self._mujoco.mjtState.mjSTATE_INTEGRATION
         physics = np.empty(self._mujoco.mj_stateSize(self.model, spec))
         self._mujoco.mj_getState(self.model, self.data, physics, spec)
-        return Snapshot(physics, self._control.gripper_command.copy(), self.instance)
+        return Snapshot(physics, self._control.gripper_command, self.instance)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Back to a snapshot, of this world or of another one of the same task."""
         if self.instance is not snapshot.instance:
             self.load(snapshot.instance)
         self._mujoco.mj_setState(self.model, self.data, snapshot.physics, self._mujoco.mjtState.mjSTATE_INTEGRATION)
-        self._control.gripper_command[:] = snapshot.gripper_command
+        self._control.gripper_command = snapshot.gripper_command
         self._mujoco.mj_step1(self.model, self.data)
 
     # -- inside --------------------------------------------------------------------------------------------------------
@@ -255,7 +267,9 @@ class World:
         self._insides = {name: self._site(name, entity.inside) for name, entity in self._entities.items() if entity.inside}
         self._parts = {name: self._part(name, entity.joint) for name, entity in self._entities.items() if entity.joint}
         self._bottoms = {name: float(data.xpos[body][2] - self.lowest_point(name)) for name, body in self._bodies.items()}
-        self._fingers = {side: _colliding(model, f"gripper0_right_{finger}") for side, finger in (("left", "finger1"), ("right", "finger2"))}
+        gripper = self.robot.gripper
+        self._fingers = {side: frozenset(model.geom(name).id for name in geoms) for side, geoms in (("left", gripper.left), ("right", gripper.right))}
+        self._pads = [self._pad(model.geom(name).id) for name in gripper.pads or ()]
 
     def _site(self, thing: str, site: str) -> int:
         """Index of a thing's site."""
@@ -264,6 +278,11 @@ class World:
         except KeyError:
             raise ContentError("assets/objects/objects.toml", thing, f"its model has no site {site!r}") from None
 
+    def _pad(self, geom: int) -> tuple[int, float, float]:
+        """A finger's pad: its geom, on which side of the middle it is (1 or -1), and half of how thick it is, metres."""
+        side = np.sign(self.grip_matrix[:, 0] @ (self.data.geom_xpos[geom] - self.grip_position))
+        return geom, float(side), float(self.model.geom_size[geom].min())
+
     def _part(self, thing: str, joint: str) -> tuple[int, float, float]:
         """Address and range of a thing's moving part."""
         try:
@@ -271,8 +290,3 @@ class World:
         except KeyError:
             raise ContentError("assets/objects/objects.toml", f"{thing}.joint", f"its model has no joint {joint!r}") from None
         return int(found.qposadr[0]), float(found.range[0]), float(found.range[1])
-
-
-def _colliding(model: Any, prefix: str) -> frozenset[int]:
-    """Geoms of a finger that touch things: robosuite's finger meshes only react (`conaffinity`), its pads do both."""
-    return frozenset(geom for geom in range(model.ngeom) if model.geom(geom).name.startswith(prefix) and model.geom_conaffinity[geom])

@@ -4,7 +4,6 @@ They come from the dataset's `annotation.*` columns and its side file `meta/osel
 so labels are by the roles of a task's instructions.
 """
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import read_json
 from osel_sim.training.projection import Pinhole
 
 SIDE_FILE = "osel_sim.json"
@@ -145,23 +145,6 @@ def load_annotations(folder: Path, columns: dict[str, NDArray[Any]]) -> Annotati
             name.removeprefix(PLACES): columns[name].reshape(len(target), -1, 2).astype(np.float32) for name in columns if name.startswith(PLACES)
         },
     )
-
-
-def read_json(file: Path) -> dict[str, Any]:
-    """A dataset's JSON object.
-
-    Raises:
-        DataError: it cannot be read or is none.
-    """
-    try:
-        value = json.loads(file.read_text())
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read ({error.strerror}); is it a LeRobotDataset? python -m osel_sim.collect writes one") from None
-    except ValueError as error:
-        raise DataError(f"{file}: {error}") from None
-    if not isinstance(value, dict):
-        raise DataError(f"{file}: must hold an object")
-    return value
 
 
 def _first_two(target: NDArray[np.int64], entities: int) -> NDArray[np.int64]:

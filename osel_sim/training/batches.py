@@ -11,7 +11,7 @@ from torch import Tensor
 
 from osel_sim.training.dataset import Demonstrations
 from osel_sim.training.recipe import Augmentation
-from osel_sim.training.source import Source, Wanted
+from osel_sim.training.source import SampleSource, Wanted
 
 STATE_FLOOR = 0.005
 """Least standard deviation (metres, radians) the state is normalised by: one that hardly varies in the demonstrations must not blow up."""
@@ -60,7 +60,7 @@ class Batches:
         weights: Sequence[float] | None = None,
     ) -> None:
         center, spread = (statistics[OBS_STATE][key].numpy() for key in ("mean", "std"))
-        self._sources = [Source(one, wanted, augmentation, center, spread) for one in data]
+        self._sources = [SampleSource(one, wanted, augmentation, center, spread) for one in data]
         self._frames, self._seed = list(frames), seed
         shares = np.array([1.0] * len(self._sources) if weights is None else weights, np.float64)
         edges = np.round(np.cumsum(shares) / shares.sum() * sum(map(len, frames))).astype(np.int64)

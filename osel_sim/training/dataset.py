@@ -4,7 +4,6 @@ LeRobotDataset decodes a PNG each time a frame is fetched, about 1 ms a frame an
 than for its own arithmetic. Images live in `<dataset>/.cache/<fingerprint>/`, written under another name first and renamed when whole.
 """
 
-import hashlib
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,11 +15,13 @@ import cv2
 import numpy as np
 import pyarrow.parquet as parquet
 from numpy.typing import NDArray
-from tqdm import tqdm  # type: ignore[import-untyped]
 
+from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import atomic, content_digest, is_partial, read_json
+from osel_sim.core.progress import progress as progress_bar
 from osel_sim.interface.policy import ACTION_DIM, STATE_DIM
-from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations, read_json
+from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations
 
 IMAGES = "observation.images."
 INFO = "meta/info.json"
@@ -63,7 +64,7 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
     Raises:
         DataError: not such a dataset, or a camera, the state or the action missing or of another shape.
     """
-    info = read_json(folder / "meta" / "info.json")
+    info = read_json(folder / INFO, "is it a LeRobotDataset? python -m osel_sim.collect writes one")
     features = info.get("features", {})
     for name, shape in {"observation.state": [STATE_DIM], "action": [ACTION_DIM]}.items():
         if features.get(name, {}).get("shape") != shape:
@@ -76,6 +77,8 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
     files = sorted((folder / "data").glob("*/*.parquet"))
     if not files:
         raise DataError(f"{folder}: no data/*/*.parquet")
+    for file in files:
+        check_rows(file)
     wanted = ["observation.state", "action", "episode_index", "task_index"]
     wanted += [name for name in features if name.startswith("annotation.")]
     columns = _columns(files, wanted)
@@ -115,7 +118,8 @@ def dataset_folders(given: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for folder in given:
-        inside = [folder] if (folder / INFO).is_file() else sorted(file.parents[1] for file in folder.glob(f"*/{INFO}"))
+        within = sorted(file.parents[1] for file in folder.glob(f"*/{INFO}"))
+        inside = [folder] if (folder / INFO).is_file() else [one for one in within if not is_partial(one)]
         if not inside:
             raise DataError(f"{folder}: no LeRobotDataset in it ({INFO}); python -m osel_sim.collect writes one")
         found += inside
@@ -139,11 +143,8 @@ def _columns(files: list[Path], names: list[str]) -> dict[str, NDArray[Any]]:
 
 
 def _fingerprint(folder: Path, files: list[Path]) -> str:
-    digest = hashlib.sha256((folder / "meta" / "info.json").read_bytes())
-    for file in files:
-        stat = file.stat()
-        digest.update(f"{file.relative_to(folder)} {stat.st_size} {stat.st_mtime_ns}".encode())
-    return digest.hexdigest()[:16]
+    stats = [(file.relative_to(folder), file.stat()) for file in files]
+    return content_digest((folder / INFO).read_bytes(), *(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats))[:16]
 
 
 def _images(folder: Path, files: list[Path], camera: str, shape: tuple[int, ...], frames: int, fingerprint: str, progress: bool) -> NDArray[np.uint8]:
@@ -155,12 +156,11 @@ def _images(folder: Path, files: list[Path], camera: str, shape: tuple[int, ...]
             if stale.name != fingerprint:
                 shutil.rmtree(stale, ignore_errors=True)
         home.mkdir(parents=True, exist_ok=True)
-        partial = home / f"{camera}.partial"
-        array = np.lib.format.open_memmap(partial, mode="w+", dtype=np.uint8, shape=(frames, *shape))
-        _decode(files, IMAGES + camera, array, f"decoding {camera}", progress)
-        array.flush()
-        del array
-        partial.replace(target)
+        with atomic(target) as partial:
+            array = np.lib.format.open_memmap(partial, mode="w+", dtype=np.uint8, shape=(frames, *shape))
+            _decode(files, IMAGES + camera, array, f"decoding {camera}", progress)
+            array.flush()
+            del array
     mapped: NDArray[np.uint8] = np.load(target, mmap_mode="r", allow_pickle=False)
     return mapped
 
@@ -174,7 +174,7 @@ def _decode(files: list[Path], column: str, out: NDArray[np.uint8], label: str, 
         out[position] = image
 
     position = 0
-    with ThreadPoolExecutor() as pool, tqdm(total=len(out), desc=label, unit="frame", disable=not progress) as bar:
+    with ThreadPoolExecutor() as pool, progress_bar(len(out), "frame", label, quiet=not progress) as bar:
         for file in files:
             for batch in parquet.ParquetFile(file).iter_batches(batch_size=DECODE_ROWS, columns=[column]):
                 encoded = batch.column(0).field("bytes").to_pylist()

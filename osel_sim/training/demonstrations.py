@@ -6,7 +6,6 @@ LeRobotDataset that was not finalised cannot be read.
 
 import functools
 import json
-import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -16,8 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.files import read_json, write_text
+from osel_sim.formats.run_config import robots_said
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM
+from osel_sim.interface.robot import DEFAULT_ROBOT
 
 CAMERAS = ("agentview", "wrist")
 BURST_PROBABILITY = 0.04
@@ -42,6 +44,10 @@ class Shard:
     image_size: int
     levels: tuple[int, ...]
     axes: Mapping[str, int] = field(default_factory=dict)
+    robot: str = DEFAULT_ROBOT
+
+    def __str__(self) -> str:
+        return self.folder.name
 
 
 def features(task: TaskSpec, image_size: int) -> dict[str, dict[str, Any]]:
@@ -69,6 +75,7 @@ def side_file(task: TaskSpec, levels: tuple[int, ...], axes: Mapping[str, int], 
     return {
         "task": task.name,
         "task_version": task.version,
+        **robots_said([task]),
         "levels": list(levels),
         "axes": dict(axes),
         "split": "train",
@@ -90,7 +97,7 @@ def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
     """
     done = shard.folder / "done.json"
     if done.is_file():
-        report = json.loads(done.read_text())
+        report = read_json(done)
         return report["frames"], report["episodes"], report["failed"]
     shutil.rmtree(shard.folder, ignore_errors=True)
 
@@ -98,10 +105,10 @@ def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
 
     from osel_sim.sim.instance import make_instance
 
-    env = _env(shard.task_file)
+    env = _env(shard.task_file, shard.robot)
     task = env.task
     dataset = LeRobotDataset.create(
-        f"osel_sim/{task.name}", CONTROL_HZ, features(task, shard.image_size), root=shard.folder, robot_type="panda", use_videos=False
+        f"osel_sim/{task.name}", CONTROL_HZ, features(task, shard.image_size), root=shard.folder, robot_type=task.robot.lower(), use_videos=False
     )
     frames, episodes, failed = 0, 0, []
     for seed in range(shard.first_seed, shard.first_seed + shard.episodes):
@@ -115,19 +122,17 @@ def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
         dataset.save_episode()
         frames, episodes = frames + len(rows), episodes + 1
     dataset.finalize()
-    temporary = shard.folder / "done.json.part"
-    temporary.write_text(json.dumps({"frames": frames, "episodes": episodes, "failed": failed}))
-    os.replace(temporary, done)
+    write_text(done, json.dumps({"frames": frames, "episodes": episodes, "failed": failed}))
     return frames, episodes, failed
 
 
 @functools.lru_cache(maxsize=1)
-def _env(task_file: Path) -> Any:
+def _env(task_file: Path, robot: str) -> Any:
     """A worker's environment: a scene takes seconds to compile."""
     from osel_sim.formats.task_file import load_task_file
     from osel_sim.sim.env import TaskEnv
 
-    return TaskEnv(load_task_file(task_file))
+    return TaskEnv(load_task_file(task_file), robot=robot)
 
 
 def _demonstrate(env: Any, image_size: int, rng: np.random.Generator) -> list[dict[str, Any]] | None:

@@ -1,6 +1,7 @@
 """Held-out episodes: how far the actions and the places named by the instruction are off."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,24 +16,32 @@ BATCH = 64
 MAX_FRAMES = 2048
 
 
-def validate(
-    policy: Any,
-    batches: Batches,
-    index: int,
-    frames: int,
-    roles: list[str],
-    preprocess: Callable[[dict[str, Any]], dict[str, Any]],
-    postprocess: Callable[[Tensor], Tensor],
-    spread: Tensor,
-    executed: int,
-) -> dict[str, float]:
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out episodes and how to measure on them.
+
+    Attributes:
+        batches: of the held-out frames of every dataset.
+        preprocess, postprocess: the policy's own.
+        spread: (3,), metres a unit of the normalised position.
+        executed: how many actions of a chunk will be executed; errors count over those.
+    """
+
+    batches: Batches
+    preprocess: Callable[[dict[str, Any]], dict[str, Any]]
+    postprocess: Callable[[Tensor], Tensor]
+    spread: Tensor
+    executed: int
+
+
+def validate(policy: Any, held: HeldOut, index: int, frames: int, roles: list[str]) -> dict[str, float]:
     """Errors on held-out frames of one dataset (at most `MAX_FRAMES`, evenly spread in blocks).
 
     Args:
         policy: a LeRobot policy that predicts chunks; if it has `locate`, what it says about places is measured, too.
+        index: which dataset.
+        frames: how many held-out frames it has.
         roles: names of the roles of that dataset's instructions.
-        spread: (3,), metres a unit of the normalised position.
-        executed: how many actions of a chunk will be executed; errors count over those.
 
     Returns:
         action_error (mean absolute error of the six motions), gripper_accuracy, and where labelled <role>_cm (median distance between estimated and
@@ -46,14 +55,14 @@ def validate(
     policy.eval()
     with torch.inference_mode():
         for block in keep:
-            raw = batches.validation(index, starts[block], BATCH)
-            truth, valid = raw[ACTION][:, :executed], ~raw["action_is_pad"][:, :executed]
-            batch = preprocess(dict(raw))
-            actions = postprocess(policy.predict_action_chunk(batch))[:, :executed].cpu()
+            raw = held.batches.validation(index, starts[block], BATCH)
+            truth, valid = raw[ACTION][:, : held.executed], ~raw["action_is_pad"][:, : held.executed]
+            batch = held.preprocess(dict(raw))
+            actions = held.postprocess(policy.predict_action_chunk(batch))[:, : held.executed].cpu()
             errors.append((actions[..., :6].clamp(-1, 1) - truth[..., :6]).abs().mean(-1)[valid])
             hits.append(((actions[..., 6] > 0) == (truth[..., 6] > 0))[valid].float())
             if GROUNDING_POSITIONS in raw and hasattr(policy, "locate"):
-                offset = (policy.locate(batch).cpu() - raw[GROUNDING_POSITIONS][:, 0]) * spread
+                offset = (policy.locate(batch).cpu() - raw[GROUNDING_POSITIONS][:, 0]) * held.spread
                 distances.append(offset.norm(dim=-1))
     result = {"action_error": float(torch.cat(errors).mean()), "gripper_accuracy": float(torch.cat(hits).mean())}
     if distances:

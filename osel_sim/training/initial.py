@@ -1,6 +1,5 @@
 """Training that begins with the weights of a checkpoint."""
 
-from hashlib import sha256
 from pathlib import Path
 
 import torch
@@ -11,8 +10,11 @@ from safetensors.torch import load_file
 from torch import nn
 
 from osel_sim.core.errors import CheckpointError
+from osel_sim.core.files import content_digest
+from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
 from osel_sim.policy import register
 from osel_sim.policy.perception_step import PerceptionStep
+from osel_sim.policy.trust import check_checkpoint
 from osel_sim.training.batches import Statistics
 
 WEIGHTS = "model.safetensors"
@@ -22,7 +24,7 @@ class Initial:
     """A LeRobot checkpoint folder to begin with.
 
     Raises:
-        CheckpointError: it is none, or cannot be read.
+        CheckpointError: it is none, cannot be read, or asks for code that is not allowed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -30,11 +32,16 @@ class Initial:
         self.folder = folder
         if not (folder / WEIGHTS).is_file():  # LeRobot would take it for a hub name
             raise CheckpointError(f"{folder}: is no checkpoint to begin with: it has no {WEIGHTS}")
+        check_checkpoint(folder)
         try:
-            self.config = PreTrainedConfig.from_pretrained(folder)
-            self._weights = load_file(folder / WEIGHTS)
-            before, _ = make_pre_post_processors(self.config, str(folder), preprocessor_overrides={"device_processor": {"device": "cpu"}})
+            with no_foreign_code():
+                self.config = PreTrainedConfig.from_pretrained(folder)
+                self._weights = load_file(folder / WEIGHTS)
+                before, _ = make_pre_post_processors(self.config, str(folder), preprocessor_overrides={"device_processor": {"device": "cpu"}})
         except Exception as error:  # the hub client, JSON, safetensors and draccus all have their own
+            failed = what_failed(error)
+            if isinstance(failed, ForeignCodeError):
+                raise ForeignCodeError(f"{folder}: {failed}") from None
             raise CheckpointError(f"{folder}: is no checkpoint to begin with ({type(error).__name__}: {' '.join(str(error).split())})") from None
         found = [step.stats for step in before.steps if isinstance(step, NormalizerProcessorStep)]
         self.statistics: Statistics = {
@@ -44,7 +51,7 @@ class Initial:
             if isinstance(step, PerceptionStep):
                 parts = {"policy": self._weights, "perception": step.state_dict()}
                 self._weights = {f"{part}.{name}": value for part, values in parts.items() for name, value in values.items()}
-        self.digest = sha256(b"".join(file.read_bytes() for file in sorted(folder.glob("*.safetensors")))).hexdigest()
+        self.digest = content_digest(*(file.read_bytes() for file in sorted(folder.glob("*.safetensors"))))
 
     def fill(self, trainee: nn.Module, kind: str) -> None:
         """Give a module in training the checkpoint's weights.

@@ -1,7 +1,6 @@
 """The models that recipes name: LeRobot configurations, policies and processors, made by LeRobot's own factory."""
 
 import copy
-import shutil
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from torch import Tensor, nn
 
 from osel_sim.core.errors import UsageError
+from osel_sim.core.files import atomic_files
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.policy import ACTION_DIM, STATE_DIM
 from osel_sim.policy import register
@@ -102,24 +102,19 @@ class Model:
         """Write config.json, model.safetensors and the processors; in half precision the file is half as big and loads as float32 all the same."""
         portable = copy.copy(self.config)
         portable.device = "cpu"
-        partial = folder / "checkpoint.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
         dtype = torch.float16 if half else torch.float32
         policy: Any = trained.policy if isinstance(trained, PerceivingACT) else trained
         state = policy.state_dict()
         weights = {name: value.to("cpu", dtype if value.is_floating_point() else value.dtype).contiguous() for name, value in state.items()}
-        policy.save_pretrained(partial, state_dict=weights)
-        portable._save_pretrained(partial)
         last = None
         if isinstance(trained, PerceivingACT) and self.perception is not None:
             last = replace(self.perception, half=half)
             last.load_state_dict(trained.perception.state_dict())
-        for pipeline in self.pipelines(portable, last):
-            pipeline.save_pretrained(partial)
-        for file in sorted(partial.iterdir()):
-            file.replace(folder / file.name)
-        partial.rmdir()
+        with atomic_files(folder) as partial:
+            policy.save_pretrained(partial, state_dict=weights)
+            portable._save_pretrained(partial)
+            for pipeline in self.pipelines(portable, last):
+                pipeline.save_pretrained(partial)
 
 
 def make_model(spec: PolicySpec, recipe: Recipe, data: list[Demonstrations], statistics: Statistics, device: str) -> Model:

@@ -1,35 +1,33 @@
 """Trains one policy by its recipe, on one or several datasets, and writes a LeRobot checkpoint folder."""
 
 import copy
-import json
 import os
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import torch
 from lerobot.utils.constants import OBS_STATE
-from numpy.typing import NDArray
+from torch import nn
 
-from osel_sim.core import content
-from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, UsageError
+from osel_sim.core.files import finite, write_json
+from osel_sim.core.shown import shown
 from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.training.batches import Batches, frames_of, statistics_of
-from osel_sim.training.dataset import Demonstrations, dataset_folders, load_demonstrations, task_of
-from osel_sim.training.evaluation import validate
+from osel_sim.training.batches import Batches, statistics_of
+from osel_sim.training.dataset import Demonstrations, task_of
+from osel_sim.training.evaluation import HeldOut, validate
 from osel_sim.training.initial import Initial
-from osel_sim.training.loop import Trainer
+from osel_sim.training.loop import Problem, Trainer, warm_up_then_cosine
 from osel_sim.training.memory import keep_memory
 from osel_sim.training.models import make_model
-from osel_sim.training.recipe import Recipe
-from osel_sim.training.state import write_json
+from osel_sim.training.recipe import Optimisation, Recipe
+from osel_sim.training.split import load_datasets, split
 
 
 @dataclass(frozen=True)
@@ -66,130 +64,144 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
         folders: datasets, or folders of datasets.
 
     Raises:
-        DataError: a dataset or an earlier state does not fit.
+        DataError: a dataset does not fit, or an earlier state is damaged.
         UsageError: `out` is in use and `resume` was not asked for.
-        CheckpointError: `init` is no checkpoint, or one of another model.
+        CheckpointError: `init` is no checkpoint, or one of another model; or an earlier state is of other data, another seed or recipe.
     """
-    began = time.time()
     if not options.resume and options.out.exists() and any(options.out.iterdir()):
         raise UsageError(f"{options.out} is not empty: continue it with --resume, or give another --out")
     torch.set_num_threads(options.threads or os.cpu_count() or 1)
     cv2.setNumThreads(0)  # images are small: threads would only get in the way of torch's
     keep_memory()
     torch.backends.cuda.enable_flash_sdp(torch.cuda.is_available())  # on a CPU its backward pass takes twice as long as plain matrix products
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    initial = Initial(options.init) if options.init is not None else None
-    data = load_datasets(folders, spec, recipe)
-    splits = [_split(one, recipe) for one in data]
-    frames = [frames_of(one, training) for one, (training, _) in zip(data, splits, strict=True)]
-    held_frames = [frames_of(one, held) for one, (_, held) in zip(data, splits, strict=True)]
-    statistics = {**statistics_of(data, frames), **(initial.statistics if initial is not None else {})}
-    torch.manual_seed(options.seed)
-    model = make_model(spec, recipe, data, statistics, device)
-    wanted = model.wanted(recipe.optimisation.grounding_pairs)
-    weights = [recipe.weights.get(one.name, 1.0) for one in data]
-    batches = Batches(data, frames, statistics, wanted, recipe.augmentation, options.seed, weights)
-    held_batches = Batches(data, held_frames, statistics, wanted, recipe.augmentation, options.seed)
-    (prepare, _), (prepare_held, finish) = model.preparing(), model.preparing()
-    size = recipe.optimisation.batch_size
-    trainee = model.trainee()
-    if initial is not None:
-        initial.fill(trainee, recipe.type)
-    identity = json.dumps(
-        [recipe.to_dict(), [one.fingerprint for one in data], options.seed, list(spec.cameras), initial and initial.digest], sort_keys=True
-    )
-    trainer = Trainer(
-        trainee,
-        lambda step: prepare(batches.training(step, size)),
-        recipe.optimisation,
-        device,
-        options.out,
-        sha256(identity.encode()).hexdigest(),
-        options.seed,
-    )
-    resumed = options.resume and trainer.resume()
-    if not resumed and options.minutes is not None:
-        trainer.steps = trainer.steps_in(options.minutes)
-    parameters = sum(parameter.numel() for parameter in trainee.parameters())
-    print(
-        f"{spec.name}: {recipe.type}, {parameters / 1e6:.2f}M parameters, {len(data)} dataset(s) with {sum(map(len, frames))} frames to train on, "
-        f"{trainer.steps} steps of {size} on {device}" + (f", continued at {trainer.progress.step}" if resumed else ""),
-        file=sys.stderr,
-    )
-    validations: list[dict[str, Any]] = []
-    average = copy.deepcopy(trainee)
+    return PolicyTraining(spec, recipe, folders, options).run()
 
-    def record(step: int) -> dict[str, Any]:
+
+class PolicyTraining:
+    """The training of one policy: see `train`."""
+
+    def __init__(self, spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Options) -> None:
+        self._began = time.time()
+        self._spec, self._recipe, self._options = spec, recipe, options
+        self._device = "cuda" if torch.cuda.is_available() else "cpu"
+        self._initial = Initial(options.init) if options.init is not None else None
+        data = load_datasets(folders, spec, recipe)
+        self._parts = [split(one, recipe) for one in data]
+        frames = [part.frames for part in self._parts]
+        statistics = {**statistics_of(data, frames), **(self._initial.statistics if self._initial is not None else {})}
+        torch.manual_seed(options.seed)
+        self._model = make_model(spec, recipe, data, statistics, self._device)
+        wanted = self._model.wanted(recipe.optimisation.grounding_pairs)
+        weights = [recipe.weights.get(one.name, 1.0) for one in data]
+        batches = Batches(data, frames, statistics, wanted, recipe.augmentation, options.seed, weights)
+        held = Batches(data, [part.held for part in self._parts], statistics, wanted, recipe.augmentation, options.seed)
+        prepare, _ = self._model.preparing()
+        self._held = HeldOut(held, *self._model.preparing(), statistics[OBS_STATE]["std"][:3], spec.execute)
+        trainee = self._model.trainee()
+        if self._initial is not None:
+            self._initial.fill(trainee, recipe.type)
+        self._parameters = sum(parameter.numel() for parameter in trainee.parameters())
+        self._average = copy.deepcopy(trainee)
+        self._validations: list[dict[str, Any]] = []
+        size, settings = recipe.optimisation.batch_size, recipe.optimisation
+        problem = Problem(
+            module=trainee,
+            batch_of=lambda step: prepare(batches.training(step, size)),
+            loss_of=lambda batch: trainee({name: value.to(self._device, non_blocking=True) for name, value in batch.items()}),
+            optimiser=_optimiser(trainee, settings),
+            rate=warm_up_then_cosine(settings.warmup_steps),
+            clipped=tuple(trainee.parameters()),
+            clip=settings.gradient_clip,
+            ema_decay=settings.ema_decay,
+            seed=options.seed,
+        )
+        self._trainer = Trainer(problem, settings.steps, self._device, options.out, self._identity())
+
+    def run(self) -> dict[str, Any]:
+        """Train, validate and save; returns what `training.json` holds."""
+        options, trainer = self._options, self._trainer
+        resumed = options.resume and trainer.resume()
+        if not resumed and options.minutes is not None:
+            trainer.steps = trainer.steps_in(options.minutes)
+        frames = sum(len(part.frames) for part in self._parts)
+        print(
+            f"{self._spec.name}: {self._recipe.type}, {self._parameters / 1e6:.2f}M parameters, {len(self._parts)} dataset(s) with {frames} frames "
+            f"to train on, {trainer.steps} steps of {self._recipe.optimisation.batch_size} on {self._device}"
+            + (f", continued at {trainer.progress.step}" if resumed else ""),
+            file=sys.stderr,
+        )
+        trainer.run({options.evaluate_every: self._evaluate}, save_every=options.save_every, label=self._spec.name, until=options.until)
+        return self._record(trainer.progress.step)
+
+    def _identity(self) -> dict[str, Any]:
+        """What must be the same to continue."""
         return {
-            "policy": spec.name,
-            "command": " ".join(["python -m osel_sim.train", *sys.argv[1:]]),
-            "seed": options.seed,
-            "recipe": recipe.to_dict(),
-            "init": {"name": initial.folder.name, "sha256": initial.digest} if initial is not None else None,
-            "datasets": [
-                {"task": one.name, "fingerprint": one.fingerprint, "episodes": one.episodes, "trained_on": len(training), "frames": len(own)}
-                for one, (training, _), own in zip(data, splits, frames, strict=True)
-            ],
-            "parameters": parameters,
-            "steps": step,
-            "steps_planned": trainer.steps,
-            "training_seconds": round(trainer.progress.seconds, 1),
-            "wall_seconds": round(time.time() - began, 1),
-            "threads": torch.get_num_threads(),
-            "device": device,
-            "precision": "bfloat16" if computes_bfloat16(device) else "float32",
-            "losses": trainer.progress.losses,
-            "validation": validations,
+            "recipe": self._recipe.to_dict(),
+            "data": [part.data.fingerprint for part in self._parts],
+            "seed": self._options.seed,
+            "cameras": list(self._spec.cameras),
+            "init": self._initial.digest if self._initial is not None else None,
         }
 
-    def evaluate(step: int) -> None:
-        average.load_state_dict(trainer.average)
-        spread = statistics[OBS_STATE]["std"][:3]
+    def _evaluate(self, step: int) -> None:
+        """Save the averaged weights as a checkpoint, with their errors on held-out episodes and the success of rollouts."""
+        options, data = self._options, [part.data for part in self._parts]
+        self._average.load_state_dict(self._trainer.average)
         by_task: dict[str, dict[str, float]] = {one.name: {} for one in data}
-        for index, (one, held) in enumerate(zip(data, held_frames, strict=True)):
-            if len(held):
-                roles = list(one.annotations.roles) if one.annotations is not None else []
-                by_task[one.name] |= validate(average, held_batches, index, len(held), roles, prepare_held, finish, spread, spec.execute)
-        model.save(average, options.out, half=options.half)
+        for index, part in enumerate(self._parts):
+            if len(part.held):
+                roles = list(part.data.annotations.roles) if part.data.annotations is not None else []
+                by_task[part.data.name] |= validate(self._average, self._held, index, len(part.held), roles)
+        self._model.save(self._average, options.out, half=options.half)
         if options.rollouts:
             from osel_sim.training.rollouts import success_rate
 
             for one in data:
                 task = _task(one)
-                by_task[one.name]["success_rate"] = success_rate(spec, options.out, task, options.rollouts, options.seed, options.tasks)
+                by_task[one.name]["success_rate"] = success_rate(self._spec, options.out, task, options.rollouts, options.seed, options.tasks)
         for task, result in by_task.items():
-            print(f"{task}: " + "  ".join(f"{name} {value:.4g}" for name, value in result.items()), file=sys.stderr)
-        validations.append({"step": step, **(next(iter(by_task.values())) if len(data) == 1 else {"tasks": by_task, **_means(by_task)})})
-        write_json(options.out / "training.json", record(step))
+            print(f"{shown(task)}: " + "  ".join(f"{name} {value:.4g}" for name, value in result.items()), file=sys.stderr)
+        self._validations.append({"step": step, **(next(iter(by_task.values())) if len(data) == 1 else {"tasks": by_task, **_means(by_task)})})
+        write_json(options.out / "training.json", finite(self._record(step)))
 
-    trainer.run({options.evaluate_every: evaluate}, save_every=options.save_every, label=spec.name, until=options.until)
-    return record(trainer.progress.step)
+    def _record(self, step: int) -> dict[str, Any]:
+        """What `training.json` holds after so many steps."""
+        initial, progress = self._initial, self._trainer.progress
+        return {
+            "policy": self._spec.name,
+            "command": " ".join(["python -m osel_sim.train", *sys.argv[1:]]),
+            "seed": self._options.seed,
+            "recipe": self._recipe.to_dict(),
+            "init": {"name": initial.folder.name, "sha256": initial.digest} if initial is not None else None,
+            "datasets": [
+                {
+                    "task": part.data.name,
+                    "fingerprint": part.data.fingerprint,
+                    "episodes": part.data.episodes,
+                    "trained_on": part.episodes,
+                    "frames": len(part.frames),
+                }
+                for part in self._parts
+            ],
+            "parameters": self._parameters,
+            "steps": step,
+            "steps_planned": self._trainer.steps,
+            "training_seconds": round(progress.seconds, 1),
+            "wall_seconds": round(time.time() - self._began, 1),
+            "threads": torch.get_num_threads(),
+            "device": self._device,
+            "precision": "bfloat16" if computes_bfloat16(self._device) else "float32",
+            "losses": progress.losses,
+            "validation": self._validations,
+        }
 
 
-def load_datasets(folders: Sequence[Path], spec: PolicySpec, recipe: Recipe) -> list[Demonstrations]:
-    """The datasets of the recipe's tasks among those given.
-
-    Raises:
-        DataError: one cannot be read, two are of one task, one that the recipe wants is missing, or only some are annotated.
-        UnknownNameError: the recipe weighs a task that there is not.
-    """
-    found = {task_of(folder) or folder.resolve().name: folder for folder in dataset_folders(folders)}
-    if len(found) < len(dataset_folders(folders)):
-        raise DataError(f"{', '.join(map(str, folders))}: two datasets are of one task; there can be one of each of {', '.join(found)}")
-    for task in recipe.weights:  # of a task that is not trained on: no matter, but a wrong name is one
-        if task not in found and task not in content.files("tasks"):
-            raise UnknownNameError("task", task, {**found, **content.files("tasks")}, f"data.weights of {recipe.file}")
-    for task in recipe.tasks or ():
-        if task not in found:
-            raise DataError(f"{recipe.file}: wants demonstrations of {task!r}, there are those of: {', '.join(sorted(found))}")
-    data = [load_demonstrations(folder, spec.cameras) for task, folder in found.items() if recipe.tasks is None or task in recipe.tasks]
-    labelled = {one.name: one.annotations is not None for one in data}
-    located = {one.name: one.annotations is not None and all(one.annotations.sees(camera) for camera in spec.cameras) for one in data}
-    for known, what in ((labelled, "annotations"), (located, "known places in the images")):
-        lacking = [task for task, has in known.items() if not has]
-        if 0 < len(lacking) < len(data):
-            raise DataError(f"{', '.join(lacking)}: no {what}, which the other datasets have; collect them anew, or train without the others")
-    return data
+def _optimiser(trainee: nn.Module, settings: Optimisation) -> torch.optim.Optimizer:
+    """AdamW, without weight decay for biases and scales."""
+    decayed = [parameter for parameter in trainee.parameters() if parameter.ndim > 1]
+    others = [parameter for parameter in trainee.parameters() if parameter.ndim <= 1]
+    groups = [{"params": decayed, "weight_decay": settings.weight_decay}, {"params": others, "weight_decay": 0.0}]
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, fused=True)
 
 
 def _means(by_task: dict[str, dict[str, float]]) -> dict[str, float]:
@@ -198,24 +210,9 @@ def _means(by_task: dict[str, dict[str, float]]) -> dict[str, float]:
     return {key: sum(result[key] for result in results) / len(results) for key in results[0] if all(key in result for result in results)}
 
 
-def _split(data: Demonstrations, recipe: Recipe) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Training episodes (the first ones, as many as the recipe wants) and validation episodes (the last ones)."""
-    held = min(recipe.validation_episodes, data.episodes // 5)
-    available = data.episodes - held
-    wanted = recipe.episodes if recipe.episodes is not None else available
-    if wanted > available:
-        print(f"{data.folder}: {wanted} training episodes wanted, {available} there", file=sys.stderr)
-    if available < 1:
-        raise DataError(f"{data.folder}: no episodes to train on")
-    return np.arange(min(wanted, available)), np.arange(available, data.episodes)
-
-
 def _task(data: Demonstrations) -> str:
     """The task the demonstrations are of, as the side file says."""
     task = task_of(data.folder)
     if task is None:
         raise DataError(f"{data.folder}: does not say which task the demonstrations are of, so there are no rollouts (--eval-episodes 0)")
     return task
-
-
-__all__ = ["Options", "load_datasets", "train"]

@@ -45,9 +45,11 @@ class Pinhole:
         Args:
             state: (batch, 8), of which the grip site's position and axis-angle are used.
         """
+        from scipy.spatial.transform import Rotation
+
         offset = points.astype(np.float64)
         if self.mount == "gripper":
-            rotation = rotation_matrices(state[:, 3:6].astype(np.float64))
+            rotation = Rotation.from_rotvec(state[:, 3:6].astype(np.float64)).as_matrix()
             offset = np.einsum("bji,bnj->bni", rotation, offset - state[:, None, :3])
         seen = (offset - self.position) @ self.rotation
         depth = -seen[..., 2] * np.tan(np.radians(self.fovy) / 2)
@@ -70,13 +72,3 @@ def places_in_view(pose: dict[str, Any], points: NDArray[np.float32], state: NDA
     places = Pinhole.from_dict(pose).places(points[None], state[None])[0]
     flat: NDArray[np.float32] = np.nan_to_num(places, nan=OUT_OF_VIEW).reshape(-1)
     return flat
-
-
-def rotation_matrices(vectors: Array) -> Array:
-    """Axis-angle (batch, 3) -> (batch, 3, 3), by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)
-    x, y, z = (vectors / np.maximum(angle, 1e-12)[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    result: Array = np.eye(3) + np.sin(angle)[:, None, None] * cross + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
-    return result

@@ -40,7 +40,7 @@ class Wanted:
     pairs: int = 0
 
 
-class Source:
+class SampleSource:
     """Makes samples of one dataset.
 
     Args:

@@ -16,7 +16,7 @@ from osel_sim.policy.grounding import TextEncoder
 from osel_sim.policy.language_chunk.configuration_language_chunk import LanguageChunkConfig
 from osel_sim.policy.language_chunk.network import ActionHead
 from osel_sim.policy.perception import KeypointCamera, perceive, percept_size
-from osel_sim.policy.scene import ChunkQueue, Scene, action_weight, grounding_losses, look
+from osel_sim.policy.scene import ChunkQueue, PerceivedScene, action_weight, grounding_losses, look
 
 
 class LanguageChunkPolicy(ChunkQueue, PreTrainedPolicy):  # type: ignore[misc]
@@ -38,7 +38,7 @@ class LanguageChunkPolicy(ChunkQueue, PreTrainedPolicy):  # type: ignore[misc]
         self.head = ActionHead(percept_size(config, len(self.image_keys)), config.hidden, config.hidden_layers, config.chunk_size, action.shape[0])
         self.reset()
 
-    def compute(self, batch: dict[str, Tensor]) -> tuple[Tensor, Scene]:
+    def compute(self, batch: dict[str, Tensor]) -> tuple[Tensor, PerceivedScene]:
         """The network: actions (batch, chunk, action_dim), and what was seen."""
         found, scene = perceive(self.text, self.cameras, self.image_keys, batch)
         with torch.autocast(found.device.type, enabled=False):

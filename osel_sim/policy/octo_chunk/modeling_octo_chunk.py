@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from osel_sim.policy.grounding import PLACE_FEATURES, STATE_FEATURES, Grounding, GroundingCamera, TextEncoder, fuse, mlp
 from osel_sim.policy.octo_chunk.configuration_octo_chunk import OctoChunkConfig
 from osel_sim.policy.octo_chunk.network import FlowHead, Readout
-from osel_sim.policy.scene import ChunkQueue, Scene, action_weight, grounding_losses, look, own_geometry
+from osel_sim.policy.scene import ChunkQueue, PerceivedScene, action_weight, grounding_losses, look, own_geometry
 
 ACTIVE = 2  # readouts that find: the thing to handle now, and where it goes
 NOISE_SEED = 20240513
@@ -57,7 +57,7 @@ class OctoChunkPolicy(ChunkQueue, PreTrainedPolicy):  # type: ignore[misc]
         self.register_buffer("noise", noise, persistent=False)
         self.reset()
 
-    def read(self, batch: dict[str, Tensor]) -> tuple[Tensor, Scene, list[Grounding], Tensor]:
+    def read(self, batch: dict[str, Tensor]) -> tuple[Tensor, PerceivedScene, list[Grounding], Tensor]:
         """Everything before the action head.
 
         Returns:

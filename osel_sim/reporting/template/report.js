@@ -86,6 +86,16 @@
     return axis.labelAngle ? Math.max(0, 0.82 * letters(scale.domain[scale.domain.length - 1]) - column / 2) : 0;
   }
 
+  // A title in lines of at most so many letters.
+  function broken(title, letters) {
+    const lines = [""];
+    for (const word of title.split(" ")) {
+      if (lines[lines.length - 1].length + word.length < letters) lines[lines.length - 1] += ` ${word}`;
+      else lines.push(word);
+    }
+    return lines.map((line) => line.trim()).filter(Boolean);
+  }
+
   function fitted(spec, panel, width) {
     const { $schema, config, datasets, data: common } = spec;  // panels of the same data have it once, above them
     const fit = structuredClone({ ...(common && { data: common }), ...panel, $schema, config, datasets });
@@ -97,7 +107,10 @@
       for (const [channel, own] of Object.entries(layer.encoding || {})) {
         if (channel === "x" && own.type === "nominal") fit.padding = { left: 5, top: 5, bottom: 5, right: 5 + Math.round(slant(own, width)) };
         if (own.field === "name" && ["color", "shape", "strokeDash"].includes(channel)) own.legend = null;
-        if (width >= NARROW || !own.axis) continue;
+        if (width >= NARROW) continue;
+        if (channel === "x" && own.title) own.title = broken(own.title, (0.7 * width) / 6.5);
+        if (own.legend) Object.assign(own.legend, { title: broken(own.legend.title, (0.7 * width) / 6), columns: 3 });
+        if (!own.axis) continue;
         if (channel === "y" && own.type === "nominal") own.axis.labelLimit = Math.round(width / 3.4);
         if (channel === "x" && own.type === "quantitative") own.axis.tickCount = 4;
       }
@@ -190,9 +203,10 @@
     const columns = Object.keys(book.episodes);
     const all = book.episodes.instance.map((_, row) => Object.fromEntries(columns.map((name) => [name, book.episodes[name][row]])));
     all.forEach((episode) => { episode.about = book.instances[episode.instance]; episode.policyName = book.policies[episode.policy]; });
-    const controls = Object.fromEntries(["task", "target", "policy", "outcome", "kind", "text"].map((name) => [name, document.getElementById(`filter-${name}`)]));
+    const controls = Object.fromEntries(["task", "robot", "target", "policy", "outcome", "kind", "text"].map((name) => [name, document.getElementById(`filter-${name}`)]));
     const distinct = (values) => [...new Set(values.filter(Boolean))].sort();
     options(controls.task, "all tasks", distinct(book.instances.map((item) => item.task)));
+    options(controls.robot, "all robots", distinct(book.instances.map((item) => item.robot)));
     const targets = distinct(book.instances.map((item) => item.target));
     options(controls.target, "anything", targets, targets.map(plain));
     options(controls.policy, "all policies", book.policies);
@@ -217,6 +231,7 @@
     function fits(episode) {
       const wanted = controls.outcome.value;
       return (!controls.task.value || episode.about.task === controls.task.value)
+        && (!controls.robot.value || episode.about.robot === controls.robot.value)
         && (!controls.target.value || episode.about.target === controls.target.value)
         && (!controls.policy.value || episode.policyName === controls.policy.value)
         && (!wanted || ended(episode, wanted))

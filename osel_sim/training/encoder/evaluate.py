@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.encoder import OpenClipEncoder, encode_many
+from osel_sim.context.encoder import encode_many
+from osel_sim.context.open_clip_encoder import OpenClipEncoder
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.formats.terms import KINDS
 from osel_sim.training.encoder.captions import NAMINGS, PLACES, Captions
@@ -23,19 +24,19 @@ PROBED = 50
 
 
 def measure_all(encoder: OpenClipEncoder, tasks: Sequence[TaskSpec], scenes: Sequence[Scenes]) -> dict[str, Any]:
-    """`measure` of one task; of several: that of each under `tasks`, and over all scenes together `task`, how well contexts tell the tasks apart."""
+    """`measure_task` of one task; of several that of each under `tasks`, and under `task`, over all scenes, how well contexts tell tasks apart."""
     if len(tasks) == 1:
-        return measure(encoder, tasks[0], scenes[0])
+        return measure_task(encoder, tasks[0], scenes[0])
     pictured = [([image], text) for one in scenes for image, text in zip(one.images, one.instructions.tolist(), strict=True)]
     contexts = encode_many(encoder, pictured)
     labels = np.repeat([task.name for task in tasks], [len(one) for one in scenes])
     result: dict[str, Any] = {"neighbours": {"agree": neighbour_agreement(contexts, labels), "chance": chance(labels)}}
     if len(contexts) >= PROBED:
         result["probe"] = _probe(contexts, labels)
-    return {"task": _rounded(result), "tasks": {task.name: measure(encoder, task, one) for task, one in zip(tasks, scenes, strict=True)}}
+    return {"task": _rounded(result), "tasks": {task.name: measure_task(encoder, task, one) for task, one in zip(tasks, scenes, strict=True)}}
 
 
-def measure(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, seed: int = 0) -> dict[str, Any]:
+def measure_task(encoder: OpenClipEncoder, task: TaskSpec, scenes: Scenes, seed: int = 0) -> dict[str, Any]:
     """Everything `training.json` says about an encoder; all numbers but `place_r2` are fractions in [0, 1].
 
     - `image_to_instruction`: its own instruction among 5 that name, in the same words, an object that is not there (chance 1/6);

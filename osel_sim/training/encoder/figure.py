@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.encoder import DEFAULT_ENCODER, encode_many, load_encoder
+from osel_sim.context.encoder import encode_many, load_encoder
+from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
 from osel_sim.core.content import find
 from osel_sim.core.errors import OselError
 
@@ -27,14 +28,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--instances", type=int, default=600, help="test instances (default: %(default)s)")
     options = parser.parse_args(arguments)
     try:
-        draw(options.encoder, options.task, options.data, options.out, options.instances)
+        draw_contexts(options.encoder, options.task, options.data, options.out, options.instances)
     except OselError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     return 0
 
 
-def draw(encoder_name: str, task_name: str, data: Path, out: Path, count: int) -> None:
+def draw_contexts(encoder_name: str, task_name: str, data: Path, out: Path, count: int) -> None:
     """Encode `count` test instances, lay them out with t-SNE, and write the picture with the neighbour agreement in each title."""
     import altair as alt
     from sklearn.manifold import TSNE

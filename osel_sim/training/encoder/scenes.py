@@ -1,6 +1,7 @@
 """Pictures of a task's instances with what is where on them: what the embedded encoder learns from and is measured on."""
 
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.arrays import read_arrays
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import atomic
+from osel_sim.core.progress import progress
 from osel_sim.formats.task_file import TaskSpec
 
 CAMERA = "agentview"
@@ -41,10 +45,8 @@ class Scenes:
     def save(self, file: Path) -> None:
         """Write them, at once or not at all."""
         file.parent.mkdir(parents=True, exist_ok=True)
-        temporary = file.with_suffix(".tmp")
-        with temporary.open("wb") as handle:
+        with atomic(file) as partial, partial.open("wb") as handle:
             np.savez(handle, allow_pickle=False, **{field.name: getattr(self, field.name) for field in fields(self)})
-        temporary.replace(file)
 
     @classmethod
     def load(cls, file: Path) -> "Scenes":
@@ -54,24 +56,24 @@ class Scenes:
             DataError: it is something else.
         """
         try:
-            with np.load(file, allow_pickle=False) as archive:
-                return cls(**{field.name: archive[field.name] for field in fields(cls)})
-        except (OSError, ValueError, KeyError, EOFError) as error:
-            raise DataError(f"{file}: not a file of scenes ({' '.join(str(error).split())}); remove it to render them again") from None
+            arrays = read_arrays(file, "scenes")
+            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+        except DataError as error:
+            raise DataError(f"{error}; remove it to render them again") from None
+        except KeyError as error:
+            raise DataError(f"{file}: not a file of scenes ({error}); remove it to render them again") from None
 
 
-def render_scenes(task: TaskSpec, seeds: Iterable[int], split: str, size: int, levels: Sequence[int] = (0,)) -> Scenes:
+def render_instances(task: TaskSpec, seeds: Iterable[int], split: str, size: int, levels: Sequence[int] = (0,)) -> Scenes:
     """Load each instance into the simulator and take its picture; seeds go through `levels` in turn."""
-    from rich.progress import track
-
     from osel_sim.sim.env import TaskEnv
     from osel_sim.sim.instance import make_instance
 
-    env = TaskEnv(task)
     order = {entity.name: index for index, entity in enumerate(task.entities)}
     rows: dict[str, list[Any]] = {field.name: [] for field in fields(Scenes)}
-    try:
-        for seed in track(list(seeds), f"rendering {split} scenes"):
+    wanted = list(seeds)
+    with closing(TaskEnv(task)) as env, progress(len(wanted), "scene", f"rendering {split} scenes") as bar:
+        for seed in wanted:
             instance = make_instance(task, seed, levels[seed % len(levels)], split)
             env.load(instance)
             pixels, positions = (np.full((len(order), 2), np.nan, np.float32) for _ in range(2))
@@ -86,8 +88,7 @@ def render_scenes(task: TaskSpec, seeds: Iterable[int], split: str, size: int, l
             rows["targets"].append(instance.target)
             rows["containers"].append(instance.container)
             rows["seeds"].append(seed)
-    finally:
-        env.close()
+            bar.update()
     return Scenes(**{name: np.array(values) for name, values in rows.items()})
 
 
@@ -96,5 +97,5 @@ def cached_scenes(folder: Path, task: TaskSpec, count: int, split: str, size: in
     turned_up = "" if tuple(levels) == (0,) else "_level" + "".join(map(str, levels))
     file = folder / f"scenes_{task.name}_{split}_{count}_{size}px{turned_up}.npz"
     if not file.is_file():
-        render_scenes(task, range(count), split, size, levels).save(file)
+        render_instances(task, range(count), split, size, levels).save(file)
     return Scenes.load(file)

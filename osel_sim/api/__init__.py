@@ -1,0 +1,1 @@
+"""One configuration and one function a command: what the command line, `--config FILE` and a notebook all call."""

@@ -1,0 +1,251 @@
+"""Outcome tables of others as a rollout log."""
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from osel_sim.api.results import frame
+from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Folder, Group, Names, NonNegative, TrustSettings, settings
+from osel_sim.core.errors import SettingError, UsageError
+from osel_sim.core.trust import trusting
+from osel_sim.ingestion.mapping import VALUES
+
+if TYPE_CHECKING:
+    import pandas
+
+    from osel_sim.formats.rollout_log import Row
+    from osel_sim.ingestion.mapping import Mapping
+    from osel_sim.selection.reward import RewardWeights
+
+logger = logging.getLogger(__name__)
+
+TABLE_FLAGS = ("text", "image", "group", "key", "policy_column", "repeat_column", "duplicates", "name", *VALUES)
+COLUMNS = Group("Columns of the tables, instead of --map (a column's name; numbers hold for every row)", 1)
+DATASET = Group("A LeRobotDataset, with --metric action-mse", 2)
+
+
+@settings
+class IngestConfig(TrustSettings):
+    """Turn outcome tables of others into a rollout log with contexts."""
+
+    out: Annotated[Path | None, MAIN] = None
+    """where to write"""
+    map: Annotated[Path | None, MAIN] = None
+    """mapping file; it alone says what the columns mean"""
+    files: Annotated[Names | None, MAIN] = None
+    """tables: .csv, .tsv, .jsonl or .parquet; * stands for anything, {NAME} makes a column of it"""
+    encoder: Annotated[str | None, MAIN] = None
+    """tfidf, sentence:MODEL, MODEL:TAG of open_clip, a folder, or with images also A+tfidf and A+sentence:MODEL (default: tfidf, and with images
+    osel_small+tfidf)"""
+    preset: Annotated[Literal["mmlu", "waymo", "alfred", "oxe"] | None, MAIN] = None
+    """weights of the summary's rewards (default: mmlu, with action-mse oxe)"""
+    device: Annotated[str, OTHER] = "cpu"
+    """torch device of the encoder; on another than cpu the last bits may differ"""
+    policies_dir: Annotated[Folder | None, CONTENT] = None
+    """folder with policy files of your own"""
+
+    name: Annotated[str | None, COLUMNS] = None
+    """what the log is called; the task of instances without --group (default: the name of --out)"""
+    text: Annotated[str | None, COLUMNS] = None
+    """question or instruction: a column, or a template such as '{question} A. {a} B. {b}'"""
+    image: Annotated[Names | None, COLUMNS] = None
+    """columns with paths of images, relative to the table"""
+    group: Annotated[str | None, COLUMNS] = None
+    """what the log calls the task, such as a question's subject"""
+    key: Annotated[str | None, COLUMNS] = None
+    """identifies an instance (default: its text, images and group)"""
+    policies: Annotated[Names | None, COLUMNS] = None
+    """of a wide table, or those a long one may have; with action-mse those to run"""
+    policy_column: Annotated[str | None, COLUMNS] = None
+    """says that the table is long, and where it names the policy"""
+    repeat_column: Annotated[str | None, COLUMNS] = None
+    """numbers repeats of a policy on an instance from 0 on"""
+    duplicates: Annotated[Literal["refuse", "drop", "repeats", "keep"] | None, COLUMNS] = None
+    """a second row of the same instance (default: refuse)"""
+    success: Annotated[Names | None, COLUMNS] = None
+    """column of true and false, 1 and 0; here and below: a column, a number, or POLICY=VALUE; {policy} stands for the name"""
+    score: Annotated[Names | None, COLUMNS] = None
+    """a graded outcome, higher is better"""
+    subgoals: Annotated[Names | None, COLUMNS] = None
+    """fraction of the subgoals reached"""
+    steps: Annotated[Names | None, COLUMNS] = None
+    """steps of the robot"""
+    seconds: Annotated[Names | None, COLUMNS] = None
+    """total, where its parts are not known"""
+    upload: Annotated[Names | None, COLUMNS] = None
+    """seconds"""
+    inference: Annotated[Names | None, COLUMNS] = None
+    """seconds"""
+    download: Annotated[Names | None, COLUMNS] = None
+    """seconds"""
+    motion: Annotated[Names | None, COLUMNS] = None
+    """seconds"""
+    price: Annotated[Names | None, COLUMNS] = None
+    """cents"""
+    error: Annotated[Names | None, COLUMNS] = None
+    """why there is no valid outcome; empty where there is one"""
+    at_least: Annotated[float | None, COLUMNS] = None
+    """--success is a number of so much or more"""
+
+    metric: Annotated[Literal["table", "action-mse"], DATASET] = "table"
+    """read outcomes from a table, or measure them on logged actions"""
+    dataset: Annotated[tuple[Folder, ...] | None, DATASET] = None
+    """LeRobotDatasets; each one's folder name is a task of the log"""
+    camera: Annotated[Names | None, DATASET] = None
+    """CAMERA=COLUMN: the dataset's column of a policy's camera (default: observation.images.CAMERA)"""
+    frames: Annotated[Count | None, DATASET] = None
+    """frames of each episode, evenly spread; each is an instance (default: 4)"""
+    tolerance: Annotated[NonNegative | None, DATASET] = None
+    """success is a mean squared error of so much or less (default: 0.05)"""
+
+
+@dataclass(frozen=True)
+class IngestResult:
+    """What came of an ingestion.
+
+    Attributes:
+        folder: of the rollout log.
+        rows: of the log.
+        encoder: identity of the one whose contexts it has.
+        weights: of the summary's rewards, and the preset's name.
+        seconds: that it took.
+    """
+
+    folder: Path
+    rows: "list[Row]"
+    encoder: str
+    weights: "tuple[RewardWeights, str]"
+    seconds: float
+
+    @cached_property
+    def outcomes(self) -> "pandas.DataFrame":
+        """A row an outcome."""
+        return frame(self.rows)
+
+
+def ingest(config: IngestConfig | None = None, /, **values: Any) -> IngestResult:
+    """Turn outcome tables of others into a rollout log with contexts.
+
+    Args:
+        config: settings as one object; `values` change some of them.
+        values: settings by name, as `IngestConfig` has them.
+
+    Raises:
+        OselError: a table or its mapping is wrong; names file, row and column.
+    """
+    config = IngestConfig.of(**values) if config is None else config.changed(**values)
+    if config.out is None:
+        raise SettingError("out", "is missing: give the folder to write to")
+    with trusting(config.trust):
+        if config.metric == "action-mse":
+            _refuse(config, (*TABLE_FLAGS, "map", "files"), "--metric action-mse")
+            return _action_mse(config, config.out)
+        _refuse(config, ("dataset", "policies_dir", "camera", "frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
+        return _table(config, config.out)
+
+
+def _refuse(config: IngestConfig, names: Sequence[str], with_what: str) -> None:
+    for name in names:
+        if getattr(config, name) is not None:
+            raise UsageError(f"--{name.replace('_', '-')} does not go with {with_what}")
+
+
+def _table(config: IngestConfig, out: Path) -> IngestResult:
+    from osel_sim.context.encoder import load_log_encoder
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.text_encoders import TFIDF
+    from osel_sim.core.files import file_digest
+    from osel_sim.ingestion.convert import convert
+    from osel_sim.ingestion.readers import read_tables
+    from osel_sim.ingestion.write import IngestedInstance, check_out, load_image, write_log
+
+    start = time.perf_counter()
+    mapping = _mapping(config, out)
+    records = read_tables(mapping)
+    converted = convert(mapping, records)
+    instances = []
+    for source in converted.sources:
+        for image in source.images:
+            load_image(image, source.record.where)  # a broken one is found before an hour of encoding, not after
+        instances.append(
+            IngestedInstance(
+                source.key,
+                source.text,
+                " ".join(file_digest(image) for image in source.images),
+                lambda source=source: [load_image(image, source.record.where) for image in source.images],  # type: ignore[misc]
+            )
+        )
+    inputs = check_out(out, instances)
+    logger.info("%d rows: %d instances, %d policies, %d outcomes", len(records), len(instances), len(converted.policies), len(converted.rows))
+    if converted.dropped:
+        differing = converted.differing or "none"
+        logger.info("%d duplicate rows left out, %s of which differed from the row that was kept", converted.dropped, differing)
+    name = config.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if mapping.images else TFIDF)
+    files = sorted({record.file for record in records})
+    metadata = {
+        "task": mapping.name,
+        "policies": converted.policies,
+        "source": {"metric": "table", "files": {file.name: file_digest(file) for file in files}},
+    }
+    texts = [item.text for item in instances]
+    identity = write_log(out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(mapping.images), config.device), metadata)
+    return _result(config, out, converted.rows, identity, start)
+
+
+def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
+    from osel_sim.context.encoder import load_log_encoder
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.text_encoders import TFIDF
+    from osel_sim.episodes.drivers import choose_policies
+    from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
+    from osel_sim.ingestion.write import check_out, write_log
+
+    start = time.perf_counter()
+    if not config.dataset:
+        raise SettingError("dataset", "is missing: give the folder of a LeRobotDataset")
+    specs = choose_policies(config.policies, config.policies_dir)
+    cameras = {}
+    for item in config.camera or ():
+        camera, equals, column = item.partition("=")
+        if not (camera and equals and column):
+            raise SettingError("camera", f"must be CAMERA=COLUMN, got {item!r}")
+        cameras[camera] = column
+    measured = Measurement(config.frames or 4, 0.05 if config.tolerance is None else config.tolerance, cameras)
+    samples = open_datasets(config.dataset, specs, measured)
+    instances = [sample.instance for sample in samples]
+    inputs = check_out(out, instances)
+    rows, source = measure_errors(samples, specs, measured)
+    # By `metric`, replay and report know that what counts is the score.
+    metadata = {"task": "action-mse", "policies": [spec.name for spec in specs], "source": {"metric": "action-mse", **source}}
+    texts = [item.text for item in instances]
+    name = config.encoder or f"{DEFAULT_ENCODER}+{TFIDF}"
+    identity = write_log(out, inputs, rows, instances, lambda: load_log_encoder(name, texts, True, config.device), metadata)
+    return _result(config, out, rows, identity, start)
+
+
+def _mapping(config: IngestConfig, out: Path) -> "Mapping":
+    from osel_sim.ingestion.flags import as_table
+    from osel_sim.ingestion.mapping_file import load_mapping, parse_mapping
+
+    files = config.files or ()
+    if config.map is not None:
+        _refuse(config, (*TABLE_FLAGS, "policies", "at_least"), "--map: write it into the file")
+        return load_mapping(config.map, files)
+    if not files:
+        raise UsageError("--map or --files is missing: give a mapping file, or tables and what their columns mean")
+    for name in ("text", "success"):
+        if getattr(config, name) is None:
+            raise SettingError(name, "is missing; python -m osel_sim.ingest --help shows examples")
+    return parse_mapping(as_table(config, files), Path())
+
+
+def _result(config: IngestConfig, out: Path, rows: "list[Row]", encoder: str, start: float) -> IngestResult:
+    from osel_sim.selection.reward import preset
+
+    name = config.preset or ("oxe" if config.metric == "action-mse" else "mmlu")
+    weights = replace(preset(name), success="score") if config.metric == "action-mse" else preset(name)
+    return IngestResult(out, rows, encoder, (weights, name), time.perf_counter() - start)

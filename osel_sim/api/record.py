@@ -1,0 +1,227 @@
+"""A recording: every policy on the same instances, for a rollout log."""
+
+import logging
+import time
+from collections.abc import Mapping, Set
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+from osel_sim.api.results import RecordResult
+from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Index, InstanceSettings, Names, settings
+from osel_sim.core.errors import DataError, OselError, SettingError
+from osel_sim.core.trust import trusting
+
+if TYPE_CHECKING:
+    from osel_sim.episodes.recording import Recording
+    from osel_sim.episodes.workers import Plan
+
+logger = logging.getLogger(__name__)
+
+_FIXED = {"task": "tasks", "level": "levels", "axis": "axes"} | {name: name for name in ("instances", "start_seed", "action_noise", "split")}
+"""Setting -> key in run.json of what a recording keeps from its beginning to its end."""
+
+
+@settings
+class RecordConfig(InstanceSettings, ContentSettings):
+    """Run every policy on the same instances and write the outcomes to a rollout log."""
+
+    task: Annotated[Names, MAIN] = ()
+    """which tasks: names, tag:TAG, or all"""
+    policies: Annotated[Names | None, MAIN] = None
+    """policies to run (default: all there are)"""
+    instances: Annotated[Count, MAIN] = 200
+    """number of instances of each task"""
+    repeats: Annotated[Count | None, MAIN] = None
+    """episodes of each policy on an instance (default: 1)"""
+    repeat_every: Annotated[Count | None, MAIN] = None
+    """repeat on one in so many instances of each level only (default: on all)"""
+    encoder: Annotated[str | None, MAIN] = None
+    """osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder"""
+    out: Annotated[Path | None, MAIN] = None
+    """where to write"""
+    resume: Annotated[bool, MAIN] = False
+    """go on with the recording in --out, or add policies, repeats or an encoder's contexts to it"""
+    workers: Annotated[Count, MAIN] = 2
+    """processes; the result does not depend on how many"""
+    start_seed: Annotated[Index, INSTANCES] = 0
+    """seed of the first instance"""
+
+
+def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult:
+    """Run every policy on the same instances and write the outcomes to a rollout log.
+
+    Args:
+        config: settings as one object; `values` change some of them.
+        values: settings by name, as `RecordConfig` has them.
+
+    Raises:
+        OselError: whatever is wrong with the settings, the files they name, or what came of them; the message says what.
+    """
+    config = RecordConfig.of(**values) if config is None else config.changed(**values)
+    given = config.given
+    if config.resume and not config.task and config.out is not None:
+        config = _as_begun(config, given)
+    if config.out is None:
+        raise SettingError("out", "is missing: give the folder to write to")
+    with trusting(config.trust):
+        return _record(config, config.out, "encoder" in given)
+
+
+def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordResult:
+    from osel_sim.context.encoder import load_encoder
+    from osel_sim.core import content
+    from osel_sim.core.files import read_json, write_json
+    from osel_sim.episodes.declared_skills import declare
+    from osel_sim.episodes.recording import Recording
+    from osel_sim.formats.run_config import RUN, check_run_folder, environment, start_or_resume
+    from osel_sim.sim.gl import choose_backend
+
+    plan = _plan(config)
+    configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
+    before = read_json(folder / RUN) if config.resume and (folder / RUN).exists() else None
+    known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
+    check_run_folder(folder, known, config.resume)
+    encoder = load_encoder(plan.encoder)
+    skills = declare(plan.policies, encoder, plan.tasks, config.tasks)
+    configuration["encoder"] = encoder.identity
+    # An encoder that was given is added; the one that was there must not have changed.
+    known["encoder"] = before.get("configuration", {}).get("encoder") if before and encoder_given else encoder.identity
+    for warning in start_or_resume(folder, known, environment(choose_backend(), content.root()), config.resume, config.to_json()):
+        logger.warning(warning)
+    recording = Recording(folder, plan, encoder.identity, skills)
+    if recording.complete:
+        logger.info("%s is complete", folder)
+        return RecordResult(folder)
+    if before is not None:
+        write_json(folder / RUN, before | {"settings": config.to_json(), "configuration": configuration})
+    try:
+        done, seconds = _record_missing(recording, config.workers) if recording.missing() else (0, 0.0)
+    except OselError:
+        if not recording.grew:  # nothing came of it, such as for want of a checkpoint: the folder is as it was
+            (folder / RUN).unlink() if before is None else write_json(folder / RUN, before)
+        raise
+    recording.finish(configuration)
+    if lost := recording.lost:
+        logger.warning(
+            "%d episodes were lost, the first of them of %s, policy %s (%s); --resume --out %s records them again",
+            *(len(lost), lost[0].instance, lost[0].policy, lost[0].error, folder),
+        )
+    return RecordResult(folder, done, seconds)
+
+
+def _plan(config: RecordConfig) -> "Plan":
+    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.episodes.drivers import choose_policies, with_fallbacks
+    from osel_sim.episodes.workers import Plan
+    from osel_sim.formats.levels import parse_axes
+    from osel_sim.formats.library import select_tasks
+    from osel_sim.sim.robots import with_robot
+
+    policies = choose_policies(config.policies, config.policies_dir)
+    return Plan(
+        tasks=tuple(with_robot(select_tasks(config.task, config.tasks), config.robot)),
+        policies=tuple(policies),
+        everyone=tuple(with_fallbacks(policies, config.policies_dir)),
+        seeds=range(config.start_seed, config.start_seed + config.instances),
+        levels=tuple(config.level),
+        split=config.split,
+        encoder=config.encoder or DEFAULT_ENCODER,
+        repeats=config.repeats or 1,
+        repeat_every=config.repeat_every or 1,
+        axes=parse_axes(config.axis),
+        action_noise=config.action_noise,
+    )
+
+
+def _configuration(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
+    """Everything the rollout log depends on but the encoder, content of files included."""
+    from osel_sim.formats.run_config import content_digests, robots_said
+
+    return {
+        "tasks": [task.name for task in plan.tasks],
+        "policies": [spec.name for spec in plan.policies],
+        **robots_said(plan.tasks),
+        "instances": config.instances,
+        "start_seed": config.start_seed,
+        "repeats": plan.repeats,
+        "repeat_every": plan.repeat_every,
+        "levels": list(config.level),
+        "axes": sorted({instance.axes for instance in plan.instances.values() if instance.axes}),
+        "action_noise": config.action_noise,
+        "split": config.split,
+        "content": content_digests(plan.tasks, plan.everyone),
+    }
+
+
+def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
+    """The settings that a recording began with; policies, repeats and an encoder that were given come in addition."""
+    from osel_sim.core.files import read_json
+    from osel_sim.formats.run_config import RUN, check_run_folder
+    from osel_sim.interface.robot import DEFAULT_ROBOT
+
+    folder = cast(Path, config.out)
+    check_run_folder(folder, {}, resume=True)
+    began = read_json(folder / RUN).get("configuration", {})
+    try:
+        values = {name: began[key] for name, key in _FIXED.items()}
+        values["axis"] = tuple(part for axes in began["axes"] for part in axes.split(","))
+        for name in given & set(_FIXED):
+            own = getattr(config, name)
+            if (list(own) if isinstance(own, tuple) else own) != began[_FIXED[name]]:
+                words = " ".join(map(str, own)) if isinstance(own, tuple) else own
+                raise SettingError(name, f"{words}: {folder / RUN} began with {began[_FIXED[name]]}; leave it out, or give another --out")
+        robot = began.get("robot")
+        if config.robot not in (None, robot or DEFAULT_ROBOT):
+            raise SettingError("robot", f"{config.robot}: {folder / RUN} began with {robot or DEFAULT_ROBOT}; leave it out, or give another --out")
+        values["robot"] = robot if isinstance(robot, str) else None
+        values["policies"] = tuple(dict.fromkeys([*began["policies"], *(config.policies or ())]))
+        values["encoder"] = config.encoder or began["encoder"].partition("@")[0]
+        values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
+    except KeyError as missing:
+        raise DataError(f"{folder / RUN}: not of a recording by this version, it has no {missing}; give all flags it was made with") from None
+    return config.changed(**values)
+
+
+def _as_it_began(configuration: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
+    """The configuration as it would have been without the policies and the repeats that a recording is given later on.
+
+    Args:
+        before: what the recording began with.
+    """
+    known = dict(configuration)
+    policies, content_then = before.get("policies", []), before.get("content", {})
+    added = set(configuration["policies"]) - set(policies)
+    if added and set(policies) < set(configuration["policies"]):
+        digests = {key: value for key, value in configuration["content"].items() if key in content_then or key.partition(" ")[2] not in added}
+        known |= {"policies": policies, "content": digests}
+    repeats, every = before.get("repeats", 1), before.get("repeat_every", 1)
+    # More of them: every episode there was is still asked for.
+    if configuration["repeats"] >= repeats and (repeats == 1 or every % configuration["repeat_every"] == 0):
+        known |= {"repeats": repeats, "repeat_every": every}
+    return known
+
+
+def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
+    """Record what is not there yet, with a progress bar, and add it. Returns how many episodes, and the seconds they took."""
+    from osel_sim.core.progress import progress
+    from osel_sim.episodes.workers import record as record_episodes
+
+    plan, missing = recording.plan, recording.missing()
+    total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
+    unit = "episode" if left else "context"
+    start = time.perf_counter()
+    done = successes = 0
+    with progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar:
+        for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers):  # contexts alone need no policy
+            if recorded is None:
+                bar.update()
+                continue
+            rows = recording.add(recorded)
+            if not left:
+                bar.update()
+                continue
+            done += len(rows)
+            successes += sum(row.success for row in rows)
+            bar.note(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h")
+    return done, time.perf_counter() - start

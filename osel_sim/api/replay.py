@@ -1,0 +1,281 @@
+"""A replay: a rollout log's instances shown to selectors in random orders, and what each earns."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from osel_sim.api.results import ReplayResult
+from osel_sim.api.reward import weights_of
+from osel_sim.api.settings import MAIN, OTHER, Count, Folder, LoggedRewardSettings, Names, settings
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+
+if TYPE_CHECKING:
+    from osel_sim.analysis.engine import Setup
+    from osel_sim.analysis.live import LiveLog
+    from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.interface.selector import Selector
+    from osel_sim.selection.reward import RewardWeights
+
+    Factory = Callable[[Sequence[str], int, int], Selector]
+
+logger = logging.getLogger(__name__)
+
+COSTS, SKILLS = "expected_costs", "skills"
+"""Settings of selectors that are told what policies cost, and what they were made for, rather than learn it."""
+
+
+@settings
+class ReplayConfig(LoggedRewardSettings):
+    """Replay a rollout log to selectors: how far from the oracle is each, and is routing worth it?"""
+
+    log: Folder
+    """folder of a rollout log, or of a live run"""
+    selectors: Annotated[Names | None, MAIN] = None
+    """ppo, ucb1, auto ... (default: all there are)"""
+    policies: Annotated[Names | None, MAIN] = None
+    """policies to choose from (default: all of the log)"""
+    seeds: Annotated[Count, MAIN] = 20
+    """number of random orders"""
+    decisions: Annotated[Count | None, MAIN] = None
+    """length of a stream (default: all instances)"""
+    half: Annotated[Literal["choose", "score"] | None, MAIN] = None
+    """only this half of the instances: one to choose settings by, the other to report (default: all)"""
+    out: Annotated[Path | None, MAIN] = None
+    """where to write (default: runs/replay-LOG)"""
+    overwrite: Annotated[bool, MAIN] = False
+    """replace a replay that is in --out"""
+    workers: Annotated[Count, MAIN] = 2
+    """processes; the result does not depend on how many"""
+    unknown_costs: Annotated[bool, OTHER] = False
+    """let all selectors learn what policies cost (default: auto is told their mean cost)"""
+    unknown_skills: Annotated[bool, OTHER] = False
+    """do not tell auto what policies were made for (default: it is told what the log says of it)"""
+    no_frontier: Annotated[bool, OTHER] = False
+    """do not replay selectors at other weights of time and price as well"""
+    encoder: Annotated[str | None, OTHER] = None
+    """whose contexts, where the log has several (default: the one it was recorded with)"""
+
+    @property
+    def folder(self) -> Path:
+        """Where to write."""
+        return self.out or Path("runs") / f"replay-{self.log.resolve().name}"
+
+
+def replay(
+    log: "Path | str | ReplayConfig",
+    *,
+    selectors: "str | Sequence[str | Factory] | None" = None,
+    on_result: Callable[[ReplayResult], None] | None = None,
+    **values: Any,
+) -> ReplayResult:
+    """Show a log's instances in random orders to selectors, each of which sees only the outcome of its choice.
+
+    Args:
+        log: folder of a rollout log or of a live run; or all settings as one object, of which `values` change some.
+        selectors: names, or classes or functions of one's own: called with the policies' names, the context's length and the seed.
+        on_result: called as soon as the verdict is there, before selectors are replayed at other weights for the frontier.
+        values: settings by name, as `ReplayConfig` has them.
+
+    Raises:
+        OselError: whatever is wrong with the settings or the log; the message says what.
+    """
+    factories: dict[str, Factory] = {}
+    if isinstance(selectors, str):
+        selectors = [selectors]
+    if selectors is not None:
+        factories = {_name(selector): selector for selector in selectors if not isinstance(selector, str)}
+        values["selectors"] = [selector if isinstance(selector, str) else _name(selector) for selector in selectors]
+    config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
+    return _Replay(config, factories, on_result).execute()
+
+
+def _name(factory: Any) -> str:
+    return str(getattr(factory, "name", None) or getattr(factory, "__name__", type(factory).__name__))
+
+
+@dataclass(frozen=True)
+class _Replay:
+    """One call of `replay`."""
+
+    config: ReplayConfig
+    factories: "Mapping[str, Factory]"
+    on_result: Callable[[ReplayResult], None] | None
+
+    def execute(self) -> ReplayResult:
+        """Do it."""
+        from osel_sim.analysis.live import is_live_run, read_live
+        from osel_sim.analysis.log import read_log
+        from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
+
+        config, folder = self.config, self.config.folder
+        named = None if config.selectors is None else [name for name in config.selectors if name not in self.factories]
+        selectors = [*choose_selectors(named, halved=config.half is not None), *self.factories]
+        check_replay_folder(folder, config.overwrite)
+        if not is_live_run(config.log):
+            log = read_log(config.log, config.encoder)
+            return self._replay(selectors, log, *weights_of(config, log.metadata))
+        live = read_live(config.log, config.encoder)
+        weights, preset = weights_of(config, recorded=live.reward)
+        found = self._off_policy(live, weights)
+        if live.has_all_outcomes(weights):
+            return self._replay(selectors, live.outcomes, weights, preset, found)
+        write_off_policy(folder, found)
+        return self._tell(ReplayResult(folder, off_policy=found))
+
+    def _replay(
+        self,
+        selectors: Sequence[str],
+        log: "LoggedOutcomes",
+        weights: "RewardWeights",
+        preset: str | None,
+        off_policy: dict[str, Any] | None = None,
+    ) -> ReplayResult:
+        """Replay, write and tell; then at other weights."""
+        from osel_sim.analysis.engine import replay as replay_streams
+        from osel_sim.analysis.oracles import oracles
+        from osel_sim.analysis.result import build, tables, with_fixed
+        from osel_sim.core.progress import progress
+        from osel_sim.formats.replay_result import write_replay
+
+        config = self.config
+        log, others, left_out = self._instances(log, weights)
+        setup = self._setups(log, others, selectors)
+        here = setup(weights)
+        best = oracles(log, weights)
+        decisions = len(log) if config.decisions is None else config.decisions
+        with progress(len(selectors) * config.seeds * decisions, "decision", scale=True) as bar:
+            (chosen,) = replay_streams(
+                log, [here], selectors, range(config.seeds), config.decisions, config.workers, bar.update, factories=self.factories
+            )
+        choices = with_fixed(chosen, best)
+        result = build(log, weights, preset, choices, best, left_out, range(config.seeds))
+        result["log"]["half"] = config.half
+        result["off_policy"] = off_policy
+        result |= _told(here)
+        write_replay(config.folder, result, choices, tables(result))
+        replayed = self._tell(ReplayResult(config.folder, result, off_policy))
+        learners = [name for name in selectors if name != "random" and name not in self.factories]
+        frontier = None if config.no_frontier else self._frontier(log, setup, weights, learners)
+        if frontier is None:
+            return replayed
+        result["frontier"] = frontier
+        write_replay(config.folder, result, choices, tables(result))
+        return ReplayResult(config.folder, result, off_policy)
+
+    def _tell(self, result: ReplayResult) -> ReplayResult:
+        if self.on_result is not None:
+            self.on_result(result)
+        return result
+
+    def _instances(self, log: "LoggedOutcomes", weights: "RewardWeights") -> "tuple[LoggedOutcomes, LoggedOutcomes, Any]":
+        """What is replayed; what costs are known from and warm starts are shown (the other half, where one is replayed); what is left out."""
+        from osel_sim.analysis.streams import complete_instances
+        from osel_sim.formats.rollout_log import DECLARED
+
+        config = self.config
+        if config.policies:
+            log = log.only(config.policies)
+        others = log
+        if config.half:
+            mine = log.half(config.half)
+            if not mine.any():
+                raise UsageError(f"--half {config.half}: none of the {len(log)} instances of {log.source} is in that half; leave the flag out")
+            log, others = log.take(mine), log.take(~mine)
+        log, left_out = complete_instances(log, weights)
+        if left_out.instances:
+            logger.warning("%d instances without an outcome of every policy are left out", left_out.instances)
+        if log.skills is None and log.metadata.get(DECLARED) and not config.unknown_skills:
+            logger.warning(
+                "auto is not told what policies were made for: %s lacks examples of it in the contexts of %s; "
+                "python -m osel_sim.record --resume --out %s --encoder %s adds them",
+                *(log.source, log.encoder, log.source, log.encoder.partition("@")[0]),
+            )
+        return log, others, left_out
+
+    def _setups(self, log: "LoggedOutcomes", others: "LoggedOutcomes", selectors: Sequence[str]) -> "Callable[[RewardWeights], Setup]":
+        """Under what to replay at any weights: what selectors are told, and shown before their stream begins."""
+        from osel_sim.analysis.engine import Setup
+        from osel_sim.analysis.warm_start import WarmStart
+        from osel_sim.selection.registry import wanted_of
+
+        config = self.config
+
+        def setup(weights: "RewardWeights") -> Setup:
+            known: dict[str, Any] = {} if config.unknown_costs else {COSTS: others.expected_costs(weights)}
+            if log.skills is not None and not config.unknown_skills:
+                known[SKILLS] = log.skills
+            warm_start = WarmStart(others.contexts, others.rewards(weights)) if config.half else None
+            return Setup(weights, {name: wanted_of(name, known) for name in selectors if name not in self.factories}, warm_start)
+
+        return setup
+
+    def _frontier(
+        self, log: "LoggedOutcomes", setup: "Callable[[RewardWeights], Setup]", weights: "RewardWeights", learners: Sequence[str]
+    ) -> dict[str, Any] | None:
+        from osel_sim.analysis.frontier import selector_frontiers
+        from osel_sim.core.progress import progress
+
+        config = self.config
+        if not learners:
+            return None
+        try:
+            with progress(None, "decision", "at other weights", scale=True) as bar:
+                return selector_frontiers(log, setup, weights, learners, config.seeds, config.decisions, config.workers, bar.at)
+        except DataError as error:
+            logger.warning("no frontier of selectors: %s", error)
+            return None
+
+    def _off_policy(self, live: "LiveLog", weights: "RewardWeights") -> dict[str, Any]:
+        """Estimates from a live run's propensities."""
+        from osel_sim.analysis.evaluation import evaluate
+
+        if self.config.policies or self.config.half:
+            raise UsageError("--policies and --half are for rollout logs: a live run is evaluated as it was made")
+        return evaluate(live, weights)
+
+
+def _told(setup: "Setup") -> dict[str, Any]:
+    """What selectors were told, as `replay.json` has it."""
+    told = setup.settings.values()
+    skills = next((settings[SKILLS] for settings in told if SKILLS in settings), None)
+    return {
+        "expected_costs": next((dict(settings[COSTS]) for settings in told if COSTS in settings), None),
+        "skills": None if skills is None else {policy: list(names) for policy, names in skills.able.items()},
+    }
+
+
+def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[str]:
+    """Names of selectors to replay: those given, each once, else all that are installed. Fixed policies are left out: they are always added.
+
+    Args:
+        halved: whether there is another half of the log, whose outcomes a selector named `NAME:warm` is shown.
+
+    Raises:
+        UnknownNameError: no such selector.
+        UsageError: it needs a package that is not installed, or cannot start warm.
+    """
+    from osel_sim.analysis.engine import WARM
+    from osel_sim.analysis.result import REFERENCES
+    from osel_sim.analysis.warm_start import check_can_start_warm
+    from osel_sim.selection.registry import selector_locations
+    from osel_sim.selection.vowpal import available
+
+    locations = selector_locations()
+    if names is None:
+        # `auto` is another name of one of them, which need not run twice.
+        twins = {name for name, place in locations.items() if place == locations.get("auto") and name != "auto"}
+        names = sorted(name for name in locations if name not in twins and (available() or not name.startswith("vw_")))
+        names += [f"auto{WARM}"] if halved else []
+    for name in names:
+        kind = name.partition(":")[0]
+        if kind not in locations and name not in REFERENCES:
+            raise UnknownNameError("selector", name, {*locations, *REFERENCES} - {"fixed"})
+        if name.startswith("vw_") and not available():
+            raise UsageError(f"selector {name!r} needs the package vowpalwabbit: pip install 'osel-sim[vw]'")
+        if name.endswith(WARM) and kind != "fixed":
+            if not halved:
+                raise UsageError(f"selector {name!r} is shown the outcomes of the log's other half beforehand: say which half to replay with --half")
+            check_can_start_warm(kind)
+    return [name for name in dict.fromkeys(names) if name.partition(":")[0] != "fixed" and name not in REFERENCES]

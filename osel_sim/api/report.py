@@ -1,0 +1,100 @@
+"""The page of a live run, a replay or a rollout log."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from osel_sim.api.reward import FLAGS, weights_of
+from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, Index, LoggedRewardSettings, settings
+from osel_sim.core.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.reporting.page import Page
+
+
+@settings
+class ReportConfig(LoggedRewardSettings):
+    """Write one page about a live run, a replay or a rollout log: verdict, curves, tables, maps, episodes."""
+
+    folder: Folder
+    """folder of a live run, a replay or a rollout log"""
+    out: Annotated[Path | None, MAIN] = None
+    """where to write (default: into the folder itself)"""
+    open: Annotated[bool, MAIN] = False
+    """show it in the browser"""
+    scenes: Annotated[Index, MAIN] = 0
+    """render how so many instances begin, again from their seeds"""
+    log: Annotated[Folder | None, OTHER] = None
+    """of a replay: its rollout log, where that is no longer where it was"""
+    encoder: Annotated[str | None, OTHER] = None
+    """of a rollout log: whose contexts, where it has several (default: the one it was recorded with)"""
+    tasks: Annotated[Folder | None, CONTENT] = None
+    """with --scenes: folder with task files of your own"""
+
+
+@dataclass(frozen=True)
+class ReportResult:
+    """What `report` wrote; figures/ and tables/ lie beside the page."""
+
+    page: Path
+
+    def _repr_html_(self) -> str:
+        """A link, in a notebook."""
+        from html import escape
+
+        return f'<a href="{escape(self.page.as_posix())}">{escape(str(self.page))}</a>'
+
+
+def report(folder: "Path | str | ReportConfig", **values: Any) -> ReportResult:
+    """Write the page of a live run, a replay or a rollout log.
+
+    Args:
+        folder: of a run, a replay or a log; or all settings as one object, of which `values` change some.
+        values: settings by name, as `ReportConfig` has them.
+
+    Raises:
+        OselError: the folder holds none of these, or is damaged; the message says what.
+    """
+    from osel_sim.reporting.page import write_page
+
+    config = folder.changed(**values) if isinstance(folder, ReportConfig) else ReportConfig.of(folder=Path(folder), **values)
+    page = write_page(_page(config), config.out or config.folder)
+    if config.open:
+        import webbrowser
+
+        webbrowser.open(page.resolve().as_uri())
+    return ReportResult(page)
+
+
+def _page(config: ReportConfig) -> "Page":
+    from osel_sim.analysis.live import JOURNAL
+    from osel_sim.formats.replay_result import REPLAY
+    from osel_sim.formats.rollout_log import ROLLOUTS
+
+    folder = config.folder
+
+    def draw(log: "LoggedOutcomes") -> dict[int, bytes]:
+        from osel_sim.reporting.scenes import render_scenes
+
+        return render_scenes(log, config.scenes, config.tasks) if config.scenes else {}
+
+    if (folder / ROLLOUTS).is_file():
+        from osel_sim.analysis.log import read_log
+        from osel_sim.reporting.log_page import log_page
+
+        log = read_log(folder, config.encoder)
+        weights, _ = weights_of(config, log.metadata)
+        return log_page(log, weights, draw)
+    for setting in ("encoder", *FLAGS):
+        if getattr(config, setting) is not None:
+            raise SettingError(setting, f"{folder} is no rollout log; a run and a replay have what they were made with")
+    if (folder / REPLAY).is_file():
+        from osel_sim.reporting.replay_page import ReplayOptions, replay_page
+
+        return replay_page(folder, ReplayOptions(config.log, draw))
+    if (folder / JOURNAL).is_file():
+        from osel_sim.reporting.run_page import run_page
+
+        return run_page(folder, draw, config.out)
+    raise DataError(f"{folder} holds neither {JOURNAL} (a live run), {REPLAY} (a replay) nor {ROLLOUTS} (a rollout log)")

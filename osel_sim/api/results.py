@@ -1,0 +1,127 @@
+"""What the functions of the Python API return: tables as pandas frames, figures that show themselves in a notebook."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, is_dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+if TYPE_CHECKING:
+    import altair
+    import pandas
+
+    from osel_sim.formats.journal import Decision
+    from osel_sim.formats.rollout_log import Row
+
+
+def frame(rows: Iterable[Any]) -> "pandas.DataFrame":
+    """Dataclasses or mappings as a table, nested ones as columns `outer.inner`."""
+    import pandas
+
+    plain = [asdict(row) if is_dataclass(row) and not isinstance(row, type) else dict(row) for row in rows]
+    return pandas.json_normalize(plain)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What came of a live run.
+
+    Attributes:
+        folder: where everything lies that it wrote.
+        summary: means over all decisions and by policy, as `summary.json` has them.
+        journal: its decisions.
+        page: the page about it, or None where it could not be written.
+        interrupted: Ctrl-C ended it; `run(..., resume=True)` goes on.
+    """
+
+    folder: Path
+    summary: Mapping[str, Any]
+    journal: "tuple[Decision, ...]"
+    page: Path | None = None
+    interrupted: bool = False
+
+    @cached_property
+    def decisions(self) -> "pandas.DataFrame":
+        """A row a decision: instance, policy, propensities, outcome, reward."""
+        return frame(self.journal)
+
+    @cached_property
+    def curve(self) -> "altair.TopLevelMixin":
+        """Mean reward so far, and the share of each policy."""
+        from osel_sim.reporting.run_page import run_curve
+
+        return run_curve(self.folder).chart
+
+
+@dataclass(frozen=True)
+class RecordResult:
+    """What came of a recording.
+
+    Attributes:
+        folder: of the rollout log.
+        recorded: how many episodes were run this time.
+        seconds: that it took.
+    """
+
+    folder: Path
+    recorded: int = 0
+    seconds: float = 0.0
+
+    @cached_property
+    def rows(self) -> "list[Row]":
+        """The log's rows."""
+        from osel_sim.formats.rollout_log import read_rollouts
+
+        return read_rollouts(self.folder)[0]
+
+    @cached_property
+    def episodes(self) -> "pandas.DataFrame":
+        """A row an episode."""
+        return frame(self.rows)
+
+
+@dataclass(frozen=True)
+class ReplayResult:
+    """What came of a replay.
+
+    Attributes:
+        folder: where everything lies that it wrote.
+        result: as `replay.json` has it; None where a live run had only the outcomes of what it chose.
+        off_policy: estimates from a live run's propensities, or None.
+    """
+
+    folder: Path
+    result: Mapping[str, Any] | None = None
+    off_policy: Mapping[str, Any] | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Is routing worth it? In words; empty where nothing was replayed."""
+        return str(self.result["verdict"]["text"]) if self.result else ""
+
+    @cached_property
+    def selectors(self) -> "pandas.DataFrame":
+        """A row a selector: reward, success, price, gap closed, regret, each with its interval."""
+        return self._table("selectors")
+
+    @cached_property
+    def oracles(self) -> "pandas.DataFrame":
+        """A row an oracle."""
+        return self._table("oracles")
+
+    @cached_property
+    def paired(self) -> "pandas.DataFrame":
+        """A row a pair of selectors: their difference over the same streams."""
+        return self._table("paired")
+
+    @cached_property
+    def curve(self) -> "altair.TopLevelMixin":
+        """Mean reward of every selector over decisions, with the oracles."""
+        from osel_sim.reporting.replay_page import replay_curve
+
+        return replay_curve(self.folder).chart
+
+    def _table(self, name: str) -> "pandas.DataFrame":
+        from osel_sim.analysis.result import tables
+
+        return frame(tables(cast(dict[str, Any], self.result))[name] if self.result else [])

@@ -1,0 +1,354 @@
+"""A live run: a selector chooses which policy handles each instance, and learns from the reward."""
+
+import contextlib
+import logging
+import signal
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from osel_sim.api.results import RunResult
+from osel_sim.api.settings import (
+    MAIN,
+    OTHER,
+    OUTPUT,
+    ContentSettings,
+    Count,
+    Folder,
+    Index,
+    InstanceSettings,
+    Names,
+    RewardSettings,
+    settings,
+)
+from osel_sim.core.errors import UnknownNameError
+from osel_sim.core.trust import trusting
+
+if TYPE_CHECKING:
+    from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.episodes.live import LiveRun
+    from osel_sim.formats.policy_file import PolicySpec
+    from osel_sim.formats.task_file import TaskSpec
+    from osel_sim.interface.encoder import Encoder
+    from osel_sim.interface.policy import Policy
+    from osel_sim.interface.selector import Selector
+    from osel_sim.policy.objects import PolicyObject
+    from osel_sim.selection.reward import RewardWeights
+
+    SelectorLike = str | Callable[[Sequence[str], int, int], Selector]
+
+logger = logging.getLogger(__name__)
+
+
+@settings
+class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
+    """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward."""
+
+    task: Annotated[Names, MAIN] = ()
+    """which tasks, mixed at random: names, tag:TAG, or all"""
+    policies: Annotated[Names | None, MAIN] = None
+    """policies to choose from (default: all there are)"""
+    selector: Annotated[str, MAIN] = "ppo"
+    """ppo, auto, epsilon_greedy, random, fixed:POLICY ..."""
+    episodes: Annotated[Count, MAIN] = 60
+    """number of decisions"""
+    encoder: Annotated[str | None, MAIN] = None
+    """osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder"""
+    seed: Annotated[Index, MAIN] = 0
+    """of instances and selector"""
+    out: Annotated[Path | None, MAIN] = None
+    """where to write (default: runs/TASK-SELECTOR-sSEED)"""
+    resume: Annotated[bool, MAIN] = False
+    """go on with the run in --out"""
+    counterfactual: Annotated[bool, MAIN] = False
+    """run the other policies as well, from the same state, to compare (nothing is learnt from them)"""
+    video: Annotated[Index, OUTPUT] = 0
+    """film so many decisions, spread evenly over the run"""
+    tensorboard: Annotated[bool, OUTPUT] = False
+    """also write TensorBoard event files (needs the package tensorboard)"""
+    realtime: Annotated[bool, OTHER] = False
+    """sleep so that the robot moves in real time"""
+    warm_start: Annotated[Folder | None, OTHER] = None
+    """rollout log whose outcomes the selector is shown first (auto, linucb, thompson ...)"""
+
+    @property
+    def folder(self) -> Path:
+        """Where to write."""
+        tasks = "-".join(name.replace(":", "-") for name in self.task)
+        robot = f"-{self.robot}" if self.robot else ""
+        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}-s{self.seed}{robot}"
+
+    @property
+    def filmed(self) -> frozenset[int]:
+        """Indices of the decisions to film: the first, the last, and evenly between."""
+        count = min(self.video, self.episodes)
+        if count == 1:
+            return frozenset({0})
+        return frozenset(round(number * (self.episodes - 1) / (count - 1)) for number in range(count))
+
+
+def run(
+    config: RunConfig | None = None,
+    /,
+    *,
+    policies: "Sequence[str | Policy | PolicyObject] | None" = None,
+    selector: "SelectorLike | None" = None,
+    **values: Any,
+) -> RunResult:
+    """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward.
+
+    Args:
+        config: settings as one object; `values` change some of them.
+        policies: names of policy files, or objects with `reset` and `act` (`osel_sim.as_policy` says what they are shown and cost).
+        selector: name of a selector, or a class or function of one's own: called with the policies' names, the context's length and the seed.
+        values: settings by name, as `RunConfig` has them.
+
+    Raises:
+        OselError: whatever is wrong with the settings, the files they name, or what came of them; the message says what.
+    """
+    from osel_sim.policy.objects import split_objects
+
+    names, objects = split_objects(policies)
+    if names is not None:
+        values["policies"] = names
+    factory = None
+    if selector is not None:
+        values["selector"] = selector if isinstance(selector, str) else _name(selector)
+        factory = None if isinstance(selector, str) else selector
+    config = RunConfig.of(**values) if config is None else config.changed(**values)
+    with trusting(config.trust):
+        return _Run(config, objects, factory).execute()
+
+
+def _name(factory: Any) -> str:
+    return str(getattr(factory, "name", None) or getattr(factory, "__name__", type(factory).__name__))
+
+
+class _Run:
+    """One call of `run`.
+
+    Args:
+        objects: policies that no file describes.
+        factory: makes the selector where it is none of the registry's.
+    """
+
+    def __init__(self, config: RunConfig, objects: "Mapping[str, PolicyObject]", factory: "Callable[..., Selector] | None") -> None:
+        from osel_sim.api.reward import weights_of
+        from osel_sim.episodes.drivers import choose_policies, with_fallbacks
+        from osel_sim.formats.levels import parse_axes, resolve, split_off
+        from osel_sim.formats.library import select_tasks
+        from osel_sim.sim.robots import with_robot
+
+        self.config, self.objects, self.factory = config, objects, factory
+        if config.tensorboard:
+            from osel_sim.episodes.tensorboard import check_installed
+
+            check_installed()
+        self.tasks = with_robot(select_tasks(config.task, config.tasks), config.robot)
+        self.policies = choose_policies(config.policies, config.policies_dir, objects)
+        self.everyone = with_fallbacks(self.policies, config.policies_dir)
+        self.weights = weights_of(config)[0]
+        self._check_selector()
+        self.axes = parse_axes(config.axis)
+        levels = (split_off(resolve(level, self.axes, task.axes, task.name))[1] for task in self.tasks for level in config.level)
+        self.axes_above = sorted({label for label in levels if label})
+
+    def execute(self) -> RunResult:
+        """Do it."""
+        from osel_sim.context.encoder import load_encoder
+        from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+        from osel_sim.core import content
+        from osel_sim.formats.run_config import check_run_folder, environment, start_or_resume
+        from osel_sim.sim.gl import choose_backend
+
+        config, folder = self.config, self.config.folder
+        configuration = self._configuration()
+        check_run_folder(folder, configuration, config.resume)
+        encoder = load_encoder(config.encoder or DEFAULT_ENCODER)
+        configuration["encoder"] = encoder.identity
+        seen = self._log(config.warm_start, encoder.identity) if config.warm_start else None
+        ran_with = environment(choose_backend(), content.root())
+
+        from osel_sim.core.torch_settings import threads
+        from osel_sim.episodes.drivers import Drivers
+        from osel_sim.sim.task_envs import TaskEnvs
+
+        # The last bits of a matrix product depend on the number of threads; one, so that a run does not depend on how many there are.
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(threads(1))
+            selector = self._selector(encoder, configuration)
+            logger.info("%s: loading %s, starting servers ...", title(self.tasks), ", ".join(spec.name for spec in self.everyone))
+            drivers = stack.enter_context(Drivers(self.everyone, self.objects))
+            envs = stack.enter_context(contextlib.closing(TaskEnvs(self.tasks)))
+            # Only now, when all that could be missing is there, is the folder taken into use.
+            for warning in start_or_resume(folder, configuration, ran_with, config.resume, config.to_json()):
+                logger.warning(warning)
+            live = self._live(folder, envs, encoder, drivers, selector)
+            stack.callback(live.close)
+            if seen is not None:
+                self._start_warm(live, seen)
+            live.replay()
+            interrupted = self._decide_all(live, stack)
+        return self._finish(live, interrupted)
+
+    def _check_selector(self) -> None:
+        """Refuse an unknown selector before anything heavy is loaded."""
+        from osel_sim.selection.registry import selector_locations
+
+        if self.factory is not None:
+            return
+        kind, _, policy = self.config.selector.partition(":")
+        if kind not in selector_locations():
+            raise UnknownNameError("selector", self.config.selector, selector_locations(), "fixed:POLICY for always the same one")
+        names = [spec.name for spec in self.policies]
+        if kind == "fixed" and policy not in names:
+            raise UnknownNameError("policy", policy, names, "give --selector fixed:POLICY")
+        if self.config.warm_start is not None:
+            from osel_sim.analysis.warm_start import check_can_start_warm
+
+            check_can_start_warm(kind)
+
+    def _configuration(self) -> dict[str, Any]:
+        """Everything the journal depends on but the encoder, content of files included."""
+        from osel_sim.core.files import digest
+        from osel_sim.formats.rollout_log import ROLLOUTS
+        from osel_sim.formats.run_config import content_digests, robots_said
+
+        config = self.config
+        warm = {"warm_start": digest(config.warm_start / ROLLOUTS)} if config.warm_start else {}
+        return {
+            "tasks": [task.name for task in self.tasks],
+            **robots_said(self.tasks),
+            "episodes": config.episodes,
+            "policies": [spec.name for spec in self.policies],
+            "selector": config.selector,
+            "seed": config.seed,
+            "levels": list(config.level),
+            "axes": self.axes_above,
+            "action_noise": config.action_noise,
+            "split": config.split,
+            "reward": asdict(self.weights),
+            "counterfactual": config.counterfactual,
+            "content": {**content_digests(self.tasks, self.everyone), **warm},
+        }
+
+    def _selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
+        from osel_sim.selection.registry import make_selector
+
+        names = [spec.name for spec in self.policies]
+        if self.factory is not None:
+            return self.factory(names, encoder.dimension, self.config.seed)
+        known = _declared(self.config, self.tasks, self.policies, self.weights, encoder)
+        if "skills" in known:
+            configuration["skills"] = known["skills"].digest if known["skills"] is not None else None
+        return make_selector(self.config.selector, names, encoder.dimension, self.config.seed, **known)
+
+    def _log(self, folder: Path, encoder: str) -> "LoggedOutcomes":
+        """The rollout log of a warm start."""
+        from osel_sim.analysis.log import read_log
+
+        return read_log(folder, encoder).only([spec.name for spec in self.policies])
+
+    def _live(self, folder: Path, envs: Any, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
+        from osel_sim.episodes.live import LiveOptions, LiveRun
+
+        config = self.config
+        options = LiveOptions(
+            config.seed, tuple(config.level), config.split, config.counterfactual, config.filmed, config.realtime, self.axes, config.action_noise
+        )
+        return LiveRun(folder, self.tasks, envs, encoder, drivers, selector, self.weights, options)
+
+    def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:
+        """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
+        from osel_sim.analysis.warm_start import WarmStart, show
+
+        own = live.instance_keys(self.config.episodes)
+        log = log.take([row for row, key in enumerate(log.keys) if key not in own])
+        count = show(live.selector, WarmStart(log.contexts, log.rewards(live.weights)), live.selector.policies, self.config.seed)
+        logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
+
+    def _decide_all(self, live: "LiveRun", stack: contextlib.ExitStack) -> bool:
+        """Make all decisions, with a progress bar. Returns whether Ctrl-C ended it: the decision at hand is finished first."""
+        from osel_sim.core.progress import progress
+
+        board = None
+        if self.config.tensorboard:
+            from osel_sim.episodes.tensorboard import TensorBoard
+
+            board = stack.enter_context(TensorBoard(live.folder))
+            board.update(live)
+        total = self.config.episodes
+        with _Interrupt() as interrupt, progress(total, "episode", initial=len(live.decisions)) as bar:
+            while len(live.decisions) < total and not interrupt.asked:
+                live.decide()
+                if board is not None:
+                    board.update(live)
+                bar.note(_progress(live))
+                bar.update()
+        return interrupt.asked
+
+    def _finish(self, live: "LiveRun", interrupted: bool) -> RunResult:
+        """Write summary, curve, page and the selector's state."""
+        from osel_sim.api.run_files import write_results
+
+        summary, page = write_results(live, title(self.tasks), self.config.selector)
+        return RunResult(live.folder, summary, tuple(live.decisions), page, interrupted)
+
+
+class _Interrupt:
+    """Within, the first Ctrl-C asks to stop after the decision at hand; the second one raises KeyboardInterrupt.
+
+    Signals only reach the main thread; in another one nothing is changed.
+    """
+
+    def __init__(self) -> None:
+        self.asked = False
+        self._before: Any = None
+
+    def __enter__(self) -> "_Interrupt":
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._ask)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self._before)
+
+    def _ask(self, *_: object) -> None:
+        self.asked = True
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        logger.info("\nfinishing this decision; Ctrl-C again leaves at once")
+
+
+def title(tasks: "Sequence[TaskSpec]") -> str:
+    """What a run's tables and figures are headed."""
+    return tasks[0].name if len(tasks) == 1 else f"{len(tasks)} tasks"
+
+
+def _declared(
+    config: RunConfig, tasks: "Sequence[TaskSpec]", policies: "Sequence[PolicySpec]", weights: "RewardWeights", encoder: "Encoder"
+) -> dict[str, Any]:
+    """Settings by which a selector is told what policies declare, as far as it wants to know: what they cost, and what they were made for."""
+    from osel_sim.episodes.declared_skills import declare
+    from osel_sim.episodes.expected_costs import expected_costs
+    from osel_sim.selection.registry import setting_names
+
+    wanted, known = setting_names(config.selector), dict[str, Any]()
+    if "expected_costs" in wanted:
+        # Half of the horizon is about what a success takes; how costs differ from task to task is learned.
+        actions = sum(task.horizon for task in tasks) // (2 * len(tasks))
+        known["expected_costs"] = expected_costs(policies, weights, max(1, actions))
+    if "skills" in wanted:
+        known["skills"] = declare(policies, encoder, tasks, config.tasks)
+    return known
+
+
+def _progress(live: "LiveRun") -> str:
+    decisions = live.decisions
+    rewards = [decision.reward for decision in decisions if decision.reward is not None]
+    successes = [decision.success for decision in decisions if decision.error is None]
+    shares = (f"{name} {100 * sum(decision.policy == name for decision in decisions) / len(decisions):.0f}%" for name in live.selector.policies)
+    mean = (f"reward {sum(rewards) / len(rewards):.3f}, success {100 * sum(successes) / len(successes):.0f}%",) if rewards else ()
+    return ", ".join((*mean, *shares))

@@ -1,0 +1,107 @@
+"""Demonstrations of the scripted expert, recorded in shards by several processes and joined into LeRobotDatasets."""
+
+import json
+import logging
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from osel_sim.core.errors import UsageError, WorkerError
+from osel_sim.core.files import atomic_folder, read_json, write_text
+from osel_sim.core.processes import Lost, Work, run_jobs
+from osel_sim.formats.task_file import TaskSpec
+from osel_sim.training.annotations import SIDE_FILE
+from osel_sim.training.demonstrations import Shard, record_shard, side_file
+
+SHARD = 20
+
+
+def shards_folder(out: Path) -> Path:
+    """Where the shards of a dataset lie until they are joined."""
+    return out.with_name(out.name + ".shards")
+
+
+def seeds(out: Path) -> int | None:
+    """How many seeds the dataset is of, or None where there is none."""
+    side = out / "meta" / SIDE_FILE
+    return read_json(side).get("seeds") if side.is_file() else None
+
+
+def check_settings(folder: Path, settings: dict[str, object]) -> None:
+    """A resumed dataset must be of one kind."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "settings.json"
+    if file.is_file():
+        before = read_json(file)
+        for key, value in settings.items():
+            if before.get(key) != value:
+                raise UsageError(f"{folder}: was collected with {key} = {before.get(key)!r}, not {value!r}")
+    write_text(file, json.dumps(settings))
+
+
+def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], axes: Mapping[str, int], image_size: int, workers: int) -> str:
+    """Record all missing shards with `workers` processes, then join them into one dataset at `out`. Returns what was done, in words."""
+    from osel_sim.core.progress import progress
+    from osel_sim.sim.gl import choose_backend
+
+    choose_backend()
+    _quiet_lerobot()
+    shards = [
+        Shard(task.file, shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes, task.robot)
+        for first in range(0, episodes, SHARD)
+        for count in (min(SHARD, episodes - first),)
+    ]
+    frames = 0
+    failed: list[int] = []
+    with progress(episodes, "episode", task.name) as bar:
+        for shard, shard_frames, shard_failed in _record_shards(shards, workers):
+            frames, failed = frames + shard_frames, failed + shard_failed
+            bar.note(f"frames={frames}, failed={len(failed)}")
+            bar.update(shard.episodes)
+    _join(task, out, [shard.folder for shard in shards], side_file(task, levels, axes, len(shards), episodes, sorted(failed)))
+    return f"{out}: {episodes - len(failed)} demonstrations, {frames} frames; the expert failed on {len(failed)} of {episodes} seeds"
+
+
+def _record_shards(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shard, int, list[int]]]:
+    """Record shards in worker processes, unless they are there already: each with its number of frames and the seeds that the expert failed on.
+
+    Raises:
+        WorkerError: a worker died twice on a shard; after the others have been recorded.
+        Exception: what a shard raised, such as OSError where the disk is full.
+    """
+    lost: list[Lost[Shard]] = []
+    with closing(run_jobs(_recorder, shards, workers)) as events:
+        for event in events:
+            if isinstance(event, Lost):
+                if event.error is not None:
+                    raise event.error
+                lost.append(event)
+            else:
+                frames, _, failed = event.value
+                yield event.job, frames, failed
+    if lost:
+        raise WorkerError(f"{len(lost)} shards were lost with their worker processes, the first of them {lost[0].job} ({lost[0].cause})")
+
+
+def _recorder() -> Work[Shard, tuple[int, int, list[int]]]:
+    """What a worker does. Workers share the cores: one thread each, for numpy, torch and Mesa's rasteriser. The progress bar is the parent's."""
+    os.environ.update(OMP_NUM_THREADS="1", LP_NUM_THREADS="1", HF_DATASETS_DISABLE_PROGRESS_BARS="1")
+    _quiet_lerobot()
+    return lambda shard, _: [record_shard(shard)]
+
+
+def _quiet_lerobot() -> None:
+    """LeRobot warns, in every process, that it cannot decode videos the usual way; the images are PNG."""
+    logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
+
+
+def _join(task: TaskSpec, out: Path, folders: list[Path], side: dict[str, Any]) -> None:
+    """Make one dataset out of shards, with a side file, put in place only when it is whole."""
+    from lerobot.datasets.aggregate import aggregate_datasets
+
+    with atomic_folder(out) as partial:
+        name = f"osel_sim/{task.name}"
+        aggregate_datasets([name] * len(folders), name, roots=folders, aggr_root=partial, concatenate_data=False)
+        (partial / "meta" / SIDE_FILE).write_text(json.dumps(side, indent=1))
