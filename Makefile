@@ -1,4 +1,4 @@
-# make run | test | slow | lint | bench | policies | wheel | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
+# make run | test | slow | lint | bench | policies | schemas | wheel | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
@@ -15,7 +15,7 @@ EPISODES ?= 240
 INSTANCES ?= 50
 POLICIES := local_small remote_specialist remote_base remote_large
 
-.PHONY: run test slow lint bench policies wheel requirements environment clean
+.PHONY: run test slow lint bench policies schemas wheel requirements environment clean
 
 run: $(READY)
 	$(PYTHON) -m osel_sim.run --task pick_place --policies local_small remote_large --counterfactual --video 3 --out $(OUT) $(ARGS)
@@ -47,6 +47,10 @@ policies: $(READY)
 		mkdir -p assets/policies/$$policy && cp runs/train/$$policy/*.json runs/train/$$policy/*.safetensors assets/policies/$$policy/ || exit 1; \
 	done
 	$(PYTHON) -m osel_sim.record --task all --level 0 2 --policies $(POLICIES) --instances $(INSTANCES) --repeats 3 --repeat-every 5 --action-noise 0.05 --out runs/suite $$([ ! -f runs/suite/run.json ] || echo --resume)
+
+# JSON Schemas of TOML files, from the models that read them.
+schemas: $(READY)
+	$(PYTHON) -m osel_sim.cli.schemas
 
 wheel: $(READY)
 	$(PYTHON) -m build --no-isolation
