@@ -105,7 +105,7 @@ def test_stops_in_time_even_when_the_policy_never_answers(folder):
         (["sinusiod"], r"unknown policy 'sinusiod': did you mean 'sinusoid'\?"),
         (["sinusoid", "--host", "0.0.0.0"], "put a token into the environment variable OSEL_SIM_TOKEN"),
         (["sinusoid", "--host", "0.0.0.0", "--token-env", "MY_TOKEN"], "put a token into the environment variable MY_TOKEN"),
-        (["sinusoid", "--port", "70000"], r"--port must lie in \[0, 65535\], got 70000"),
+        (["sinusoid", "--port", "70000"], r"--port: must lie in \[0, 65535\], got 70000"),
         (["sinusoid", "--host", "no-such-host.invalid", "--token-env", "GOOD_TOKEN"], "cannot listen on no-such-host.invalid"),
         (["sinusoid", "--token-env", "SHORT_TOKEN"], "a token must be 8 to 256 printable ASCII characters"),
         (["wrong"], r"wrong\.toml: execute: must lie in"),

@@ -195,7 +195,7 @@ def test_plain_data_is_shown_whole() -> None:
 
 
 def test_a_server_logs_what_clients_send_safely() -> None:
-    code = "from osel_sim.serve import main, _Formatter; import logging; h = logging.StreamHandler(); h.setFormatter(_Formatter('%(message)s'));"
+    code = "from osel_sim.remote.serving import ShownFormatter as F; import logging; h = logging.StreamHandler(); h.setFormatter(F('%(message)s'));"
     code += "log = logging.getLogger('x'); log.addHandler(h); log.warning('refused: %s', 'a\\x1b[2J\\x9b')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == "refused: a\\x1b[2J\\x9b\n"
