@@ -7,7 +7,7 @@ suite's; its value, `module:attribute`, is called without arguments and returns 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from osel_sim.core.errors import MissingPackageError, UnknownNameError, UsageError
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.instance import SUITE_SEPARATOR
 from osel_sim.interface.suite import OURS, Suite, Task
