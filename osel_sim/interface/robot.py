@@ -37,6 +37,7 @@ class Gripper:
         model: its class in robosuite, `module:Class`.
         rest: its joints when it is open, in the model's order, radians or metres.
         closing: for each of its actuators 1 or -1: the way in which a positive command moves its control.
+        tip: metres that the scripted expert keeps its closed fingers further off a button, for what they reach further down than the Panda's.
         prepare: changes robosuite's model of it (`robosuite.models.grippers.GripperModel`) before it is mounted.
         speed: how much a control step changes the command, which runs from -1 (open) to 1 (closed).
         left, right: colliding geoms of each finger.
@@ -50,6 +51,7 @@ class Gripper:
     left: tuple[str, ...]
     right: tuple[str, ...]
     pads: tuple[str, str] | None = None
+    tip: float = 0.0
     prepare: Callable[[Any], None] | None = None
     speed: float = 0.2
 

@@ -168,7 +168,7 @@ class Expert:
         target = world.grasp_point(button)
         offset = target - world.grip_position
         sideways = float(np.hypot(offset[0], offset[1]))
-        height = -0.03 if sideways < 0.012 else HOVER * min(1.0, sideways * 8.0)
+        height = -0.03 if sideways < 0.012 else HOVER * min(1.0, sideways * 8.0) + world.robot.gripper.tip
         return self.towards(target + np.array([0.0, 0.0, height]), 0.0, CLOSED), world.opening(button) > 0.9
 
     # -- helpers -------------------------------------------------------------------------------------------------------

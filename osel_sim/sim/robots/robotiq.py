@@ -49,5 +49,6 @@ ROBOTIQ_85 = Gripper(
     left=_finger("left"),
     right=_finger("right"),
     pads=(f"{PREFIX}left_fingerpad_collision", f"{PREFIX}right_fingerpad_collision"),
+    tip=0.01,
     prepare=tighten,
 )
