@@ -36,6 +36,8 @@ def _execute(config: IngestConfig) -> int:
 
     result = ingest(config)
     weights, preset = result.weights
+    for note in result.notes:
+        print(note)
     print(f"{result.folder}: {len(result.rows)} rows, contexts of {result.encoder}, {result.seconds:.0f} s")
     print_rollouts(console(), result.rows, weights)
     print(f"reward ({preset}): {weights.success} - {weights.alpha_time} {weights.time_unit} - {weights.alpha_price} cents")

@@ -13,6 +13,7 @@ from urllib.parse import unquote
 import imageio_ffmpeg
 import numpy as np
 import pytest
+import vl_convert
 from PIL import Image
 from report_helpers import EVIL, FAR, NEAR, WEIGHTS, made_log, made_replay, made_run
 from synthetic_log import make_row, write_log
@@ -24,14 +25,22 @@ from osel_sim.episodes.tensorboard import check_installed
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.report import main as report_main
 from osel_sim.reporting import episodes
-from osel_sim.reporting.description import DARK, LIGHT, Bars, Column, Figure, Heat, Line, Panel, Points, Table, colours, thinned
+from osel_sim.reporting.areas import DARKEST, Cell, heatmap, regions, shares, stacked
+from osel_sim.reporting.charts import Figure, Look, numbers, to_images
+from osel_sim.reporting.curves import Line, curves, thinned
+from osel_sim.reporting.dots import Dot, Path, apart, certain, clouds, rows, scatter
 from osel_sim.reporting.episodes import MOST_EPISODES, list_episodes
-from osel_sim.reporting.html_tables import to_csv, to_text
-from osel_sim.reporting.log_page import log_facts
+from osel_sim.reporting.html_tables import Column, Table, to_csv, to_text
+from osel_sim.reporting.log_page import log_facts, log_page
 from osel_sim.reporting.log_sections import context_figure, policy_blocks, time_figure
-from osel_sim.reporting.matplotlib_figures import to_images
-from osel_sim.reporting.plotly_figures import to_plotly
-from osel_sim.reporting.selector_sections import MAIN, style_of
+from osel_sim.reporting.page import write_page
+from osel_sim.reporting.palette import DARK, LIGHT, colours
+from osel_sim.reporting.replay_page import ReplayOptions, replay_curve, replay_page
+from osel_sim.reporting.routes import Chosen, route_figure
+from osel_sim.reporting.run_page import run_curve, run_page
+from osel_sim.reporting.selector_sections import MAIN, look_of
+
+SCHEMA = "https://vega.github.io/schema/vega-lite"
 
 
 @pytest.fixture(scope="module")
@@ -47,14 +56,43 @@ def page_of_log(log, tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def all_pages(log, page_of_log, tmp_path_factory):
+    """The pages of a log, a replay and a live run, each with the folder it was written into."""
+    folder = tmp_path_factory.mktemp("pages")
+    found = {"log": (log_page(log, WEIGHTS), page_of_log)}
+    found["replay"] = replay_page(made_replay(folder / "replay", log), ReplayOptions()), folder / "replay"
+    found["run"] = run_page(made_run(folder / "run")), folder / "run"
+    for kind in ("replay", "run"):
+        write_page(*found[kind])
+    return found
+
+
 def embedded(page: str) -> dict:
     """The JSON of a page."""
     return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)[1])
 
 
-def without_plotly(page: str) -> str:
+def without_scripts(page: str) -> str:
     """The page before its scripts."""
     return page[: page.index('<script type="application/json"')]
+
+
+def layers(panel: dict) -> list[dict]:
+    """A panel's layers."""
+    return panel.get("layer", [panel])
+
+
+def records(spec: dict, panel: dict) -> list[dict]:
+    """All records that a panel draws from."""
+    places = [layer.get("data", panel.get("data", spec.get("data"))) for layer in layers(panel)]
+    return [record for name in dict.fromkeys(place["name"] for place in places) for record in spec["datasets"][name]]
+
+
+def scales(spec: dict, channel: str = "color") -> list[dict[str, str]]:
+    """Name -> what a channel shows it as, of each layer that has such a scale."""
+    found = [layer["encoding"].get(channel, {}).get("scale") for panel in spec["concat"] for layer in layers(panel)]
+    return [dict(zip(map(str, scale["domain"]), scale["range"], strict=True)) for scale in found if scale and "domain" in scale and "range" in scale]
 
 
 def test_page_of_a_log(page_of_log):
@@ -62,13 +100,13 @@ def test_page_of_a_log(page_of_log):
     data = embedded(page)
     for ending in ("png", "svg"):
         assert {file.stem for file in (folder / "figures").glob(f"*.{ending}")} == set(data["figures"])
-    assert {"policies_by_task", "policies_by_target", "weights_map", "frontier", "clusters", "contexts", "times"} == set(data["figures"])
+    assert {"routes", "policies_by_task", "policies_by_target", "weights_map", "frontier", "clusters", "contexts", "times"} == set(data["figures"])
     tables = {file.stem for file in (folder / "tables").glob("*.csv")}
     assert tables == {"policies", "policies_by_target", "outcome_rates", "clusters", "inequality", "trivial_weights"}
     assert len(data["episodes"]["episodes"]["policy"]) == 240
     assert "There is something to route by" in page
     assert not list(folder.rglob("*.partial"))
-    assert len(page) < 8_000_000
+    assert len(page) < 1_300_000
 
 
 def test_robots_are_told_apart_where_there_are_several(log, tmp_path):
@@ -87,17 +125,18 @@ def test_robots_are_told_apart_where_there_are_several(log, tmp_path):
 
 def test_words_from_a_log_stay_words(page_of_log):
     page = (page_of_log / "report.html").read_text()
-    body, data = without_plotly(page), embedded(page)
+    body, data = without_scripts(page), embedded(page)
     assert EVIL in [instance["instruction"] for instance in data["episodes"]["instances"]]
     assert "window.pwned" not in body
     assert FAR not in body and "far&lt;i&gt;" in body
-    assert page.count("</script>") == 3 + page.count("<\\/script>")  # data, plotly, own: no word ends one early
-    assert not re.search(r'(?:src|href)="(?!#)', body)  # nothing is fetched
+    assert page.count("</script>") == 3 + page.count("<\\/script>")  # data, vega, own: no word ends one early
+    assert not re.search(r'src="|href="(?!#|figures/|tables/)', body)  # nothing is fetched
+    for file in (page_of_log / "figures").glob("*.svg"):
+        assert "window.pwned" not in re.sub(r"<text.*?</text>", "", file.read_text())
 
 
-def test_page_of_a_replay(log, tmp_path):
-    folder = made_replay(tmp_path, log)
-    assert report_main([str(folder)]) == 0
+def test_page_of_a_replay(all_pages):
+    _, folder = all_pages["replay"]
     page = (folder / "report.html").read_text()
     data = embedded(page)
     assert {"curves", "regret", "gap_closed", "success_against_penalty", "choices", "frontier"} <= set(data["figures"])
@@ -106,10 +145,11 @@ def test_page_of_a_replay(log, tmp_path):
         rows = {row["selector"]: row for row in csv.DictReader(handle)}
     assert float(rows["ppo"]["reward"]) == result["selectors"]["ppo"]["mean_reward"]
     assert set(rows) == {"ppo", "random", f"always {NEAR} (worst single)", f"always {FAR} (best single)"}
-    curve = next(trace for trace in data["figures"]["curves"]["panels"][0]["data"] if trace["name"] == "ppo" and trace.get("showlegend", True))
-    assert curve["y"][-1] == pytest.approx(result["selectors"]["ppo"]["mean_reward"], abs=1e-4)
-    panels = data["figures"]["frontier"]["panels"]
-    lines = [next(trace for trace in panel["data"] if trace["name"] == "ppo" and trace["mode"] == "lines+markers") for panel in panels]
+    spec = data["figures"]["curves"]
+    curve = next(record for record in records(spec, spec["concat"][0]) if record.get("name") == "ppo")
+    assert curve["y"][-1] == pytest.approx(result["selectors"]["ppo"]["mean_reward"], abs=1e-3)
+    spec = data["figures"]["frontier"]
+    lines = [next(record for record in records(spec, panel) if record["name"] == "ppo" and "order" in record) for panel in spec["concat"]]
     assert [line["y"] for line in lines] == [[90.0, 80.0, None], [70.0, 60.0, 50.0]] and lines[0]["x"] == [5.0, 4.0, None]
     assert set(data["episodes"]["picks"]) == {"ppo"}
     headline = "Route with ppo" if result["verdict"]["decision"] == "route" else "Do not route: always use far&lt;i&gt;"
@@ -131,12 +171,11 @@ def test_a_replay_whose_log_has_moved(log, tmp_path, capsys):
     assert (folder / "report.html").exists()
 
 
-def test_page_of_a_live_run(tmp_path):
-    folder = made_run(tmp_path)
-    assert report_main([str(folder)]) == 0
+def test_page_of_a_live_run(all_pages):
+    _, folder = all_pages["run"]
     page = (folder / "report.html").read_text()
     data = embedded(page)
-    assert {"curves", "regret", "success_against_penalty", "choices", "propensities", "times"} <= set(data["figures"])
+    assert {"routes", "curves", "regret", "success_against_penalty", "propensities", "times"} <= set(data["figures"])
     columns = data["episodes"]["episodes"]
     assert sum(columns["chosen"]) == 40 and len(columns["policy"]) == 80
     assert [text for text in columns["error"] if text] == ["the server died <b>"]
@@ -193,27 +232,124 @@ def test_wrong_folders_and_flags(tmp_path, capsys):
     assert not (folder / "report.html").exists()
 
 
-def test_every_mark_is_drawn_both_ways():
-    line = Line("a<b>", [1, 2, 3], [1.0, np.nan, 2.0], low=[0, np.nan, 1], high=[2, np.nan, 3], dash=True, steps=True)
-    hidden = Line("hidden", [1, 2], [5.0, 6.0], shown=False)
-    points = Points("p", [1.0], [2.0], texts=["<i>"], x_interval=([0.5], [1.5]), y_interval=([1.0], [3.0]), labelled=True)
-    bars = Bars("bars", ["x $1", "y"], [1.0, 2.0], low=[0.5, 1.5], high=[1.5, 2.5])
-    heat = Heat("heat", [1.0, 10.0], [1.0, 10.0], [[0.0, 1.0], [0.5, np.nan]], "diverging")
-    panels = [
-        Panel("lines", "x", "y", [line, hidden, points]),
-        Panel("bars", "", "y", [bars], stacked=True),
-        Panel("map", "x", "y", [heat], True, True),
+@pytest.fixture(scope="module")
+def made_of_all_marks():
+    """A figure with every kind of panel, and names that must stay names."""
+    evil = Look({"a.b[c]": "c0", EVIL: "c1", "ink": "ink"}, {EVIL}, {"ink": "diamond"}, {"ink"})
+    lines = [
+        Line("a.b[c]", [1.0, np.nan, 2.0], [0, np.nan, 1], [2, np.nan, 3]),
+        Line(EVIL, [0.5, 0.7, 0.6]),
+        Line("ink", [1, 1, 1]),
     ]
-    figure = Figure("all", "All $ marks", "", panels)
+    dots = [Dot(EVIL, Estimate(1.0, 0.5, 1.5), Estimate(2.0, 1.0, 3.0)), Dot("ink", certain(1.0), certain(2.0), "here")]
+    found = {EVIL: {"x $1": Estimate(0.5, 0.4, 0.6)}, "a.b[c]": {"x $1": certain(0.1), EVIL: certain(0.2)}}
+    places = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 2.0]])
+    map_axes = np.array([0.1, 1.0, 10.0]), np.array([1.0, 10.0])
+    panels = [
+        curves("lines", [1, 2, 3], lines, evil, ("x", "y")),
+        curves("steps", [1.0, 2.0, 3.5], lines[:1], evil, ("x", "y"), (0.0, 3.0), steps=True),
+        scatter("dots", dots, evil, ("x", "y"), [Path("a.b[c]", [1, 2, np.nan], [3, 2, 1], ["p", "q", "r"])]),
+        rows("rows", ["x $1", EVIL], found, evil, "success", percent=True),
+        *clouds(places, ([EVIL, "b", "c"], [0, 1, 2]), {"cloud": (["a.b[c]", EVIL, "ink"], evil)}),
+        heatmap("cells", [Cell("row", "a.b[c]", 0.5, "50%", "half"), Cell("row", EVIL, 2.0, "all", "all")], evil),
+        shares("bars", ["one", EVIL], {"a.b[c]": [40, 60], EVIL: [60, np.nan]}, evil, "episodes (%)"),
+        stacked("areas", [1, 2], {"a.b[c]": [40, 60], EVIL: [60, 40]}, evil, ("decision", "chosen (%)")),
+        regions("map", ("x", "y"), *map_axes, np.array([[0.0, 0.5, 0.5], [1.0, 0.2, 0.0]]), 1.0, "gain", {"here": (1.0, 10.0), EVIL: (0.1, 1.0)}),
+    ]
+    return Figure("all", f"All {EVIL} marks", "", "", panels, ["ink"], one_legend=False)
+
+
+def test_every_kind_of_panel_is_drawn(made_of_all_marks):
+    figure = made_of_all_marks
+    assert figure.chart.to_dict(validate=True)["$schema"].startswith(SCHEMA)
+    json.dumps(figure.spec, allow_nan=False)
     images = to_images(figure)
-    assert images["png"].startswith(b"\x89PNG") and b"<svg" in images["svg"]
     assert images == to_images(figure)
-    drawn = to_plotly(figure)["panels"]
-    json.dumps(drawn, allow_nan=False)
-    assert drawn[0]["data"][1]["y"] == [1.0, None, 2.0]
-    assert drawn[0]["data"][1]["name"] == "a&lt;b&gt;"
-    assert drawn[0]["data"][2]["visible"] == "legendonly"
-    assert drawn[1]["layout"]["barmode"] == "stack" and drawn[2]["layout"]["xaxis"]["type"] == "log"
+    assert b"window.pwned" in images["svg"] and b"<img" not in images["svg"] and b"<script" not in images["svg"]
+    # Hidden names are not drawn, nor in the legend of the images.
+    assert images["svg"].count(b'class="mark-line role-mark') == 4  # two lines, one in steps, a path
+    assert ">ink</text>" not in images["svg"].decode()
+    (one, two), panels = records(figure.spec, figure.spec["concat"][0])[:2], figure.spec["concat"]
+    assert one["y"] == [1.0, None, 2.0] and one["low"] == [0.0, None, 1.0] and two["low"] == [None] * 3
+    assert panels[-1]["layer"][0]["encoding"]["x"]["scale"]["type"] == "log"
+    assert figure._repr_mimebundle_()
+
+
+@pytest.mark.parametrize("kind", ["log", "replay", "run"])
+def test_every_figure_keeps_to_the_schema_is_not_blank_and_says_what_it_shows(all_pages, kind):
+    page, folder = all_pages[kind]
+    for figure in page.figures:
+        figure.chart.to_dict(validate=True)
+        png, svg = (folder / "figures" / f"{figure.name}.{ending}" for ending in ("png", "svg"))
+        picture = np.asarray(Image.open(png).convert("RGB")).astype(int)
+        assert len(figure.panels) > 0 and (np.abs(picture - 255).sum(axis=2) > 60).mean() > 0.002, figure.name
+        # Every panel has marks, not only axes.
+        drawn = re.split(r'<g class="mark-group role-scope concat_\d+_group"', svg.read_text())[1:]
+        assert len(drawn) == len(figure.panels)
+        for panel in drawn:
+            assert re.search(r"role-mark[^>]*>\s*<(?:path|text)", panel), figure.name
+        assert len(figure.alternative) > 60 and re.search(r"\d", figure.alternative), figure.name
+
+
+def test_the_page_and_the_images_show_the_same_specification(page_of_log):
+    embedded_figures = embedded((page_of_log / "report.html").read_text())["figures"]
+    for name in ("routes", "policies_by_task"):
+        svg, png = ((page_of_log / "figures" / f"{name}.{ending}").read_bytes() for ending in ("svg", "png"))
+        again = vl_convert.vegalite_to_svg(embedded_figures[name])
+        assert re.sub(r"clip\d+", "clip", svg.decode()) == re.sub(r"clip\d+", "clip", again)
+        assert png == vl_convert.svg_to_png(svg.decode(), scale=2)
+
+
+@pytest.mark.parametrize("kind", ["log", "replay", "run"])
+def test_a_policy_has_one_colour_everywhere_which_no_outcome_has(all_pages, kind):
+    outcomes = {LIGHT[name] for name in ("good", "bad", "good_local", "good_remote")}
+    found: dict[str, set[str]] = {NEAR: set(), FAR: set()}
+    for figure in all_pages[kind][0].figures:
+        for scale in scales(figure.spec):
+            for name, colour in scale.items():
+                policy = name.removeprefix("always ").partition(" (")[0]
+                if policy in found and set(scale.values()) not in ({LIGHT["good"]}, {LIGHT["ink"]}):  # a heatmap of success, or of reward
+                    found[policy].add(colour)
+    assert found == {NEAR: {LIGHT["c0"]}, FAR: {LIGHT["c1"]}}
+    assert not outcomes & {LIGHT[f"c{number}"] for number in range(18)}
+
+
+def test_what_goes_where(log, tmp_path):
+    figure = route_figure(log, WEIGHTS)
+    cells = {(cell["row"], cell["name"]): cell["text"] for cell in records(figure.spec, figure.spec["concat"][0])}
+    solved = log.success[:, log.policies.index(FAR)]
+    kitchen = np.array(log.labels("task")) == "kitchen"
+    assert cells["kitchen", FAR] == f"{100 * np.nanmean(solved[kitchen]):.0f}%" and cells["all", FAR] == f"{100 * np.nanmean(solved):.0f}%"
+    assert "kitchen" in figure.alternative
+    # One task: by what was asked for. Whom a selector chose is beside it.
+    table = log.take(np.flatnonzero(kitchen))
+    wants = np.array([[int(target != "cup") for target in table.labels("target")]])
+    chosen = Chosen("ppo", np.arange(len(table))[None], wants, " of this run")
+    figure = route_figure(table, WEIGHTS, chosen)
+    cells = {(cell["row"], cell["name"]): cell["text"] for cell in records(figure.spec, figure.spec["concat"][1])}
+    assert cells["cup", NEAR] == "100%" and cells["pan", NEAR] == "0%" and cells["all", FAR] == "67%"
+    many = made_table(tmp_path, 30)
+    figure = route_figure(many, WEIGHTS)
+    names = list(dict.fromkeys(cell["row"] for cell in records(figure.spec, figure.spec["concat"][0])))
+    assert names[0] == "all" and set(names[1:3]) == {"subject_28", "subject_29"} and len(names) == 13  # the first screen, what matters first
+    assert "12 of 30" in figure.caption
+
+
+def test_dots_that_coincide_are_told_apart():
+    x, y = np.array([0.0, 0.001, 1.0, 0.5, np.nan]), np.array([0.0, 0.001, 1.0, 0.5, 0.0])
+    moved = apart(x, y)
+    assert np.abs(moved[0] - moved[1]).max() > 12 and not moved[2:].any()
+    places = apart(np.zeros(6), np.zeros(6))
+    assert min(np.hypot(*(places[one] - places[two])) for one in range(6) for two in range(one)) > 8
+    same = np.tile([[1.0, 2.0]], (5, 1))
+    (panel,) = clouds(np.concatenate([same, [[9.0, 9.0]]]), (list("abcdef"), range(6)), {"by": (["a"] * 6, Look({"a": "c0", "b": "c1"}))})
+    (record,) = panel.to_dict()["datasets"].values()
+    assert len(set(zip(record[0]["x"], record[0]["y"], strict=True))) == 6
+
+
+def test_curves_of_runs_and_replays_are_the_pages(all_pages):
+    for kind, curve in (("run", run_curve), ("replay", replay_curve)):
+        assert next(figure for figure in all_pages[kind][0].figures if figure.name == "curves").spec == curve(all_pages[kind][1]).spec
 
 
 def test_tables_as_text_and_csv():
@@ -264,45 +400,89 @@ def made_table(folder, groups, seed=None, **values):
 
 def test_every_one_of_many_groups_has_a_row(tmp_path):
     (figure,) = [block for block in policy_blocks(made_table(tmp_path, 30), WEIGHTS) if isinstance(block, Figure)]
-    for panel in figure.panels:
-        assert len(panel.rows) == 31 and panel.rows[0] == "all"
+    for panel in figure.spec["concat"]:
+        names = next(layer["encoding"]["y"]["scale"]["domain"] for layer in layers(panel) if "scale" in layer["encoding"].get("y", {}))
         # What there is to route by comes first: the groups in which the best policy of all is behind.
-        assert set(panel.rows[1:3]) == {"subject 28", "subject 29"}
-        assert all(len(np.asarray(mark.y)) == 31 for mark in panel.marks)
+        assert len(names) == 31 and names[0] == "all" and set(names[1:3]) == {"subject_28", "subject_29"}
+        dots = [record for record in records(figure.spec, panel) if "value" in record]
+        assert all(len(record["value"]) == 31 for record in dots) and {record["name"] for record in dots} == {"small", "large"}
     assert "in the first 2 of 30 groups it is behind" in figure.caption
-    drawn = to_plotly(figure)["panels"][0]
-    assert drawn["layout"]["yaxis"]["ticktext"] == list(figure.panels[0].rows) and drawn["layout"]["yaxis"]["range"] == [30.5, -0.5]
-    few = made_table(tmp_path / "few", 5)
-    assert all(isinstance(mark, Bars) for block in policy_blocks(few, WEIGHTS) if isinstance(block, Figure) for mark in block.panels[0].marks)
 
 
 def test_a_cloud_of_many_groups_shows_the_largest_and_the_rest(tmp_path):
-    panel = context_figure(made_table(tmp_path, 30), WEIGHTS).panels[0]
-    assert [mark.colour for mark in panel.marks].count("muted") == 1
-    assert panel.marks[0].name == "19 others" and len(panel.marks) == 12
-    assert sum(len(np.asarray(mark.x)) for mark in panel.marks) == 90
-    panel = context_figure(made_table(tmp_path / "fewer", 20), WEIGHTS).panels[0]
-    assert len({(mark.colour, mark.symbol) for mark in panel.marks}) == 20
+    spec = context_figure(made_table(tmp_path, 30), WEIGHTS).spec
+    (scale,) = scales({"concat": spec["concat"][:1]})
+    assert scale["19 others"] == LIGHT["muted"] and len(scale) == 12
+    (record,) = records(spec, spec["concat"][0])
+    assert len(record["x"]) == 90 and set(record["n0"]) == set(scale)
+    spec = context_figure(made_table(tmp_path / "fewer", 20), WEIGHTS).spec
+    (scale,), (shapes,) = (scales({"concat": spec["concat"][:1]}, channel) for channel in ("color", "shape"))
+    assert len({(scale[name], shapes[name]) for name in scale}) == 20
+    assert not set(scale.values()) & {LIGHT["c0"], LIGHT["c1"]}  # these are the policies'
 
 
 def test_images_grow_with_what_is_in_them():
     def height(panel):
-        return Image.open(io.BytesIO(to_images(Figure("f", "F", "", [panel]))["png"])).height
+        return Image.open(io.BytesIO(to_images(Figure("f", "F", "", "", [panel]))["png"])).height
 
-    clouds = [Points(f"group {number}", [number], [1.0]) for number in range(60)]
-    few, many = Panel("", "", "", clouds[:2], bare=True), Panel("", "", "", clouds, bare=True)
-    assert height(many) > height(few) + 12 * 15  # twelve more lines of legend do not take the room of the plot
-    short, long = (Panel("", "", "y", [Bars(who, [8 * name for name in "abcdefgh"], range(8)) for who in ("p", "q")]) for _ in range(2))
-    long = Panel("", "", "y", [Bars(mark.name, [f"{name} and so on and on" for name in mark.categories], mark.y) for mark in long.marks])
-    assert height(long) > height(short)
-    assert height(Panel("", "", "", clouds[:2], rows=[str(row) for row in range(60)])) > 1.5 * height(few)
+    def cloud(count):
+        names = [f"a group of the number {number}" for number in range(count)]
+        places = np.stack([np.arange(count), np.ones(count)], axis=1).astype(float)
+        return clouds(places, (names, range(count)), {"by": (names, Look(colours(names)))})[0]
+
+    assert height(cloud(60)) > height(cloud(2)) + 12 * 15  # more lines of legend do not take the room of the plot
+    few, many = (rows("", [str(row) for row in range(count)], {"a": {"1": certain(1.0)}}, Look({"a": "c0"}), "x") for count in (5, 60))
+    assert height(many) > 3 * height(few)
 
 
-def test_seventeen_ways_of_choosing_have_a_colour_each():
-    found = colours([str(number) for number in range(17)])
+def linear(colour: str) -> np.ndarray:
+    """Linear RGB, (3,)."""
+    values = np.array([int(colour[place : place + 2], 16) for place in (1, 3, 5)]) / 255
+    return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+
+
+def contrast(one: str, other: str) -> float:
+    """WCAG's contrast of two colours."""
+    high, low = sorted((float(linear(colour) @ [0.2126, 0.7152, 0.0722]) + 0.05 for colour in (one, other)), reverse=True)
+    return high / low
+
+
+PROTAN = np.array([[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]])
+DEUTAN = np.array([[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]])
+
+
+def oklab(colour: str, eyes: np.ndarray) -> np.ndarray:
+    """A colour as certain eyes see it (Machado 2009), in Oklab."""
+    cones = np.array([[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]])
+    axes = np.array([[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]])
+    return axes @ np.cbrt(cones @ np.clip(eyes @ linear(colour), 0.0, 1.0))
+
+
+@pytest.mark.parametrize("palette", [LIGHT, DARK], ids=["light", "dark"])
+def test_words_can_be_read_and_colours_told_apart(palette):
+    for name in ("ink", "muted", "link", "good", "bad"):
+        assert min(contrast(palette[name], palette[ground]) for ground in ("surface", "raised")) >= 4.5, name
+    names = [f"c{number}" for number in range(18)]
+    assert LIGHT.keys() == DARK.keys() and len(set(palette.values())) == len(palette)
+    assert min(contrast(palette[name], palette["surface"]) for name in names) >= 3.0
+    for eyes, eight, eighteen in ((np.eye(3), 0.085, 0.075), (PROTAN, 0.05, 0.03), (DEUTAN, 0.05, 0.04)):
+        for first, least in ((8, eight), (18, eighteen)):
+            places = [oklab(palette[name], eyes) for name in [*names[:first], "good", "bad"]]
+            apart_by = {(one, two): np.linalg.norm(places[one] - places[two]) for one in range(len(places)) for two in range(one)}
+            del apart_by[len(places) - 1, len(places) - 2]  # success and failure are told apart by words as well
+            assert min(apart_by.values()) > least
+
+
+def test_a_heatmap_can_be_read():
+    """The number in the darkest cell of any colour."""
     for palette in (LIGHT, DARK):
-        assert len({palette[name] for name in found.values()}) == 17
-    assert LIGHT.keys() == DARK.keys()
+        for name in ("good", "ink", *(f"c{number}" for number in range(18))):
+            mixed = [
+                DARKEST * int(palette[name][place : place + 2], 16) + (1 - DARKEST) * int(palette["surface"][place : place + 2], 16)
+                for place in (1, 3, 5)
+            ]
+            shade = "#" + "".join(f"{round(value):02x}" for value in mixed)
+            assert contrast(palette["ink"], shade) >= 4.5, (name, shade)
 
 
 def test_prices_show_three_digits_whatever_their_size():
@@ -343,7 +523,7 @@ def test_many_episodes_are_thinned_by_instance(tmp_path):
     log = made_log(tmp_path, instances=MOST_EPISODES // 2 + 100)
     book = list_episodes(log, WEIGHTS, scenes={1: b"picture"})
     assert len(book.data["episodes"]["policy"]) <= MOST_EPISODES + 2
-    assert "of 2,100 instances" in book.note
+    assert "of 1,600 instances" in book.note
     assert [instance["number"] for instance in book.data["instances"] if "scene" in instance] == [1]
 
 
@@ -356,6 +536,9 @@ def test_tensorboard_is_optional(monkeypatch):
 def test_selectors_shown_together_differ_in_colour():
     """More of them than there are colours, as in a replay of all; those shown are the first and the last."""
     names = [*MAIN[1:], *(f"other_{number}" for number in range(9)), MAIN[0]]
-    style = style_of(names, ("one", "two", "three", "four"), {})
-    shown = [style.colour[name] for name in names if name in style.shown]
-    assert len(shown) == len(MAIN) == len(set(shown))
+    look = look_of(names, ("one", "two", "three", "four"), {})
+    assert len(look.shown) == len(MAIN) == len({look.colour[name] for name in look.shown})
+
+
+def test_numbers_for_json():
+    assert numbers([1.23456, np.nan, np.inf, -0.000123456]) == [1.235, None, None, -0.0001235]

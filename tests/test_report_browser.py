@@ -90,23 +90,102 @@ def wait(driver, script: str, seconds: float = 90.0) -> None:
         time.sleep(0.1)
 
 
+INK = "getComputedStyle(document.querySelector('#figure-routes .mark-text.role-mark text')).fill"
+
+
+def blank(driver) -> list[str]:
+    """Figures of which some panel has no marks: no curve, dot, cell or bar."""
+    return driver.execute_script("""
+        const drawn = (plot) => [...plot.querySelectorAll(".role-mark > path, .role-mark > text")].some((mark) => {
+            const box = mark.getBBox();
+            return mark.getAttribute("fill-opacity") !== "0" && (box.width > 0 || box.height > 0);
+        });
+        return [...document.querySelectorAll(".plot")].filter((plot) => !drawn(plot)).map((plot) => plot.closest("figure").id);""")
+
+
 @pytest.mark.parametrize("name", ["log", "replay", "run", "table"])
 @pytest.mark.parametrize(("phone", "dark"), [(False, False), (True, True)])
 def test_everything_is_drawn(driver, pages, show, name, phone, dark):
     show(pages[name], phone, dark)
     assert driver.get_log("browser") == []
-    # Every panel has something in it: curves, points, bars or a map.
-    empty = driver.execute_script("""
-        const marks = ".scatterlayer .trace path, .scatterlayer .js-line, .barlayer .point path, .heatmaplayer image";
-        const plots = [...document.querySelectorAll(".plot")].filter((plot) => !plot.querySelector(marks));
-        return plots.map((plot) => plot.getAttribute("aria-label"));""")
-    assert empty == []
+    assert blank(driver) == []
     assert driver.execute_script("return document.querySelectorAll('.plot').length") >= 6
     assert driver.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
     background = driver.execute_script("return getComputedStyle(document.body).backgroundColor")
     assert background == ("rgb(23, 27, 33)" if dark else "rgb(255, 255, 255)")
-    ink = driver.execute_script("return getComputedStyle(document.querySelector('.plot .ytitle, .plot .xtitle')).fill")
-    assert ink == ("rgb(232, 236, 241)" if dark else "rgb(28, 36, 48)")
+    assert driver.execute_script(f"return {INK}") == ("rgb(232, 236, 241)" if dark else "rgb(28, 36, 48)")
+    driver.execute_script("document.querySelectorAll('details').forEach((fold) => { fold.open = true; })")
+    # No figure is cut off, none spreads beyond its panel, and no table is wider than its column.
+    wait(driver, "return [...document.querySelectorAll('.wide table')].every((table) => table.scrollWidth <= table.parentElement.clientWidth + 1)", 5)
+    beyond = """
+        const inside = (box, room) => box.right <= room.right + 1 && box.left >= room.left - 1 && box.bottom <= room.bottom + 1;
+        return [...document.querySelectorAll(".plot")].flatMap((plot) => {
+            const own = plot.querySelector("svg"), room = own.getBoundingClientRect();
+            const texts = [...own.querySelectorAll("text")].filter((text) => text.getBoundingClientRect().width > 0 && text.textContent);
+            const cut = texts.filter((text) => !inside(text.getBoundingClientRect(), room)).map((text) => text.textContent);
+            return [...cut, ...(room.right > plot.parentElement.getBoundingClientRect().right + 1 ? [plot.closest("figure").id] : [])];
+        });"""
+    assert driver.execute_script(beyond) == []
+    # One screen for each fold.
+    tall = "return [...document.querySelectorAll('.fold > .inside')].filter((inside) => inside.clientHeight > window.innerHeight).length"
+    assert driver.execute_script(tall) == 0
+
+
+def test_folded_figures_are_printed(driver, pages, show):
+    show(pages["replay"])
+    folds = driver.execute_script("return document.querySelectorAll('details.fold:not([open])').length")
+    assert folds > 10
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    assert blank(driver) == []
+    assert driver.execute_script("return [...document.querySelectorAll('.plot svg')].every((plot) => plot.getBoundingClientRect().height > 40)")
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "screen"})
+    driver.execute_script("dispatchEvent(new Event('beforeprint'))")
+    assert driver.execute_script("return document.querySelectorAll('details.fold:not([open])').length") == 0
+    driver.execute_script("dispatchEvent(new Event('afterprint'))")
+    assert driver.execute_script("return document.querySelectorAll('details.fold:not([open])').length") == folds
+
+
+def test_the_first_screen_has_the_verdict_and_what_goes_where(driver, pages, show):
+    for page in pages.values():
+        show(page)
+        seen = "return [...document.querySelectorAll('#verdict, #routes .plot svg')].map((part) => part.getBoundingClientRect().bottom)"
+        bottoms = driver.execute_script(seen)
+        assert len(bottoms) == 3 and max(bottoms) < 900
+        assert page.stat().st_size < 2_000_000
+        words = driver.execute_script("return [...document.querySelectorAll('.plot[role=img]')].map((plot) => plot.getAttribute('aria-label'))")
+        assert len(set(words)) == len(words) and all(len(text) > 60 for text in words)
+
+
+def test_pointing_tells_values_with_their_intervals(driver, pages, show):
+    show(pages["log"])
+
+    def tell(selector: str) -> str:
+        script = """
+            const item = document.querySelector(arguments[0]), box = item.getBoundingClientRect();
+            const at = {bubbles: true, clientX: box.left + box.width / 2, clientY: box.top + box.height / 2};
+            item.dispatchEvent(new MouseEvent("pointermove", at));
+            item.dispatchEvent(new MouseEvent("mousemove", at));
+            return document.getElementById("vg-tooltip-element")?.innerText || "";"""
+        return driver.execute_script(script, selector)
+
+    words = tell("#figure-routes .plot .mark-text.role-mark text:last-of-type")
+    assert FAR in words and "%" in words and "[" in words and "instances" in words
+    assert driver.execute_script("return window.pwned === undefined")
+
+
+def test_a_click_on_a_context_shows_its_episodes(driver, pages, show):
+    show(pages["log"])
+    driver.execute_script("document.getElementById('figure-contexts').closest('details').open = true")
+    click = """
+        const dot = document.querySelector("#figure-contexts .mark-symbol.role-mark path");
+        dot.scrollIntoView({block: "center", behavior: "instant"});
+        const box = dot.getBoundingClientRect();
+        return [box.left + box.width / 2, box.top + box.height / 2];"""
+    x, y = driver.execute_script(click)
+    for kind in ("mousePressed", "mouseReleased"):
+        driver.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": kind, "x": x, "y": y, "button": "left", "clickCount": 1})
+    wait(driver, "return document.getElementById('detail').open", 5)
+    assert "policy" in driver.execute_script("return document.getElementById('detail-body').innerText")
 
 
 def test_nothing_is_fetched(driver, pages, show):
@@ -119,7 +198,7 @@ def test_nothing_is_fetched(driver, pages, show):
 def test_the_theme_follows_the_system(driver, pages, show):
     show(pages["run"])
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": "dark"}]})
-    wait(driver, "return getComputedStyle(document.querySelector('.plot .ytitle')).fill === 'rgb(232, 236, 241)'")
+    wait(driver, f"return {INK} === 'rgb(232, 236, 241)'")
     assert driver.get_log("browser") == []
 
 
@@ -193,22 +272,28 @@ def test_an_episode_tells_its_grades_and_how_to_get_a_picture(driver, pages, sho
     assert "--scenes N" in words and "subgoals" not in words
 
 
-def test_a_phone_keeps_the_names_of_rows_and_shortens_those_of_a_figure(driver, pages, show):
+def test_a_phone_shows_tables_as_cards_and_shortens_the_names_of_rows(driver, pages, show):
+    cells = (
+        "return [...document.querySelectorAll('#table-policies tbody tr:first-child td')].map((cell) => [cell.dataset.label, cell.innerText.trim()])"
+    )
+    longest = "return Math.max(...[...document.querySelectorAll('#figure-policies_by_task svg text')].map((text) => text.textContent.length))"
     show(pages["table"], phone=True)
-    left = """
-        const table = document.querySelector('#table-policies .wide');
-        table.scrollLeft = 200;
-        const cells = [...table.querySelectorAll('tbody tr:first-child td')].slice(0, 2);
-        return [table.scrollLeft, table.getBoundingClientRect().left,
-            ...cells.map((cell) => cell.getBoundingClientRect().left), cells[1].getBoundingClientRect().right];"""
-    scrolled, start, first, second, end = driver.execute_script(left)
-    assert scrolled > 100 and first == pytest.approx(start + 1, abs=2) and first < second < end < 390 / 2 + start
-    names = "return [...document.querySelectorAll('#figure-policies_by_task .plot')].map((plot) => plot.querySelectorAll('.ytick').length)"
-    assert driver.execute_script(names) == [31, 31]
-    longest = "return Math.max(...[...document.querySelectorAll('#figure-policies_by_task .ytick text')].map((text) => text.textContent.length))"
+    driver.execute_script("document.querySelectorAll('details').forEach((fold) => { fold.open = true; })")
+    wait(driver, "return document.querySelector('#table-policies .wide').classList.contains('stacked')", 5)
+    assert dict(driver.execute_script(cells)).items() >= {"policy": "small", "price (cents)": "0.0400"}.items()
     assert driver.execute_script(longest) <= 20
     show(pages["table"])
     assert driver.execute_script(longest) > 30
+
+
+def test_intervals_of_a_table_are_there_when_asked_for(driver, pages, show):
+    show(pages["log"])
+    driver.execute_script("document.querySelector('#table-policies').closest('details').open = true")
+    text = "return document.querySelector('#table-policies tbody tr').innerText"
+    assert "[" not in driver.execute_script(text)
+    assert "95% interval [" in driver.execute_script("return document.querySelector('#table-policies td[title]').title")
+    driver.execute_script("document.querySelector('#table-policies').parentElement.querySelector('.intervals input').click()")
+    assert "[" in driver.execute_script(text)
 
 
 def test_a_live_run_shows_what_was_chosen_first(driver, pages, show):
@@ -219,7 +304,8 @@ def test_a_live_run_shows_what_was_chosen_first(driver, pages, show):
 
 def test_names_in_the_legend_hide_and_show(driver, pages, show):
     show(pages["replay"])
-    lines = "document.querySelectorAll('#figure-curves .scatterlayer .js-line').length"
+    driver.execute_script("document.getElementById('figure-curves').closest('details').open = true")
+    lines = "document.querySelectorAll('#figure-curves .mark-line path').length"
     before = driver.execute_script(f"return {lines}")
     driver.execute_script("document.querySelector('#figure-curves .legend button').click()")
     wait(driver, f"return {lines} < {before}")

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from osel_sim.formats.mapping import Mapping
 
 import osel_sim
 from osel_sim.core.errors import ContentError, MissingPackageError, UnknownNameError, UsageError
@@ -19,6 +18,7 @@ from osel_sim.episodes.live import LiveOptions, LiveRun
 from osel_sim.episodes.loop import Driver, Subscriber, run_episode
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
+from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.journal import read_journal
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.formats.rollout_log import DECLARED, read_rollouts
@@ -234,7 +234,7 @@ def test_without_names_policies_of_other_suites_are_left_out():
     ],
 )
 def test_conventions_are_checked_against_the_environment(conventions, key, problem):
-    spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), mapping=Mapping(**conventions))
+    spec = replace(load_policy_file(POLICIES / "toy_greedy.toml"), mapping=Conventions(**conventions))
     ((found, words),) = misfits(spec, find_task("toy:reach").specification)
     assert found == key and problem in words
 
@@ -258,7 +258,7 @@ def test_a_kind_is_told_what_it_drives_if_it_wants_to_know(arguments, works, tmp
 
 def test_quaternions_are_computed_of_an_axis_angle_and_not_known_without():
     spec = load_policy_file(POLICIES / "toy_greedy.toml")
-    wants = replace(spec, cameras=("wrist",), mapping=Mapping(state_parts=("quaternion", "gripper")))
+    wants = replace(spec, cameras=("wrist",), mapping=Conventions(state_parts=("quaternion", "gripper")))
     assert not list(misfits(wants, specification()))
     assert [key for key, _ in misfits(replace(wants, cameras=("top",)), find_task("toy:reach").specification)] == ["mapping.state_parts"] * 2
 

@@ -1,6 +1,5 @@
 """Outcome tables of others as a rollout log."""
 
-import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from osel_sim.formats.rollout_log import Row
     from osel_sim.ingestion.columns import Columns
     from osel_sim.selection.reward import RewardWeights
-
-logger = logging.getLogger(__name__)
 
 TABLE_FLAGS = ("text", "image", "group", "key", "policy_column", "repeat_column", "duplicates", "name", *VALUES)
 COLUMNS = Group("Columns of the tables, instead of --map (a column's name; numbers hold for every row)", 1)
@@ -113,6 +110,7 @@ class IngestResult:
         encoder: identity of the one whose contexts it has.
         weights: of the summary's rewards, and the preset's name.
         seconds: that it took.
+        notes: what was read and what was left out, in words.
     """
 
     folder: Path
@@ -120,6 +118,7 @@ class IngestResult:
     encoder: str
     weights: "tuple[RewardWeights, str]"
     seconds: float
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def outcomes(self) -> "pandas.DataFrame":
@@ -180,10 +179,9 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
             )
         )
     inputs = check_out(out, instances)
-    logger.info("%d rows: %d instances, %d policies, %d outcomes", len(records), len(instances), len(converted.policies), len(converted.rows))
+    notes = [f"{len(records)} rows: {len(instances)} instances, {len(converted.policies)} policies, {len(converted.rows)} outcomes"]
     if converted.dropped:
-        differing = converted.differing or "none"
-        logger.info("%d duplicate rows left out, %s of which differed from the row that was kept", converted.dropped, differing)
+        notes.append(f"{converted.dropped} duplicate rows left out, {converted.differing or 'none'} of which differed from the row that was kept")
     name = config.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if columns.images else TFIDF)
     files = sorted({record.file for record in records})
     metadata = {
@@ -193,7 +191,7 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     }
     texts = [item.text for item in instances]
     identity = write_log(out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(columns.images), config.device), metadata)
-    return _result(config, out, converted.rows, identity, start)
+    return _result(config, out, converted.rows, identity, start, tuple(notes))
 
 
 def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
@@ -245,9 +243,9 @@ def _columns(config: IngestConfig, out: Path) -> "Columns":
     return parse_columns(as_data(config, files), COMMAND_LINE, Path())
 
 
-def _result(config: IngestConfig, out: Path, rows: "list[Row]", encoder: str, start: float) -> IngestResult:
+def _result(config: IngestConfig, out: Path, rows: "list[Row]", encoder: str, start: float, notes: tuple[str, ...] = ()) -> IngestResult:
     from osel_sim.selection.reward import preset
 
     name = config.preset or ("oxe" if config.metric == "action-mse" else "mmlu")
     weights = replace(preset(name), success="score") if config.metric == "action-mse" else preset(name)
-    return IngestResult(out, rows, encoder, (weights, name), time.perf_counter() - start)
+    return IngestResult(out, rows, encoder, (weights, name), time.perf_counter() - start, notes)

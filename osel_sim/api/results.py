@@ -48,9 +48,9 @@ class RunResult:
     @cached_property
     def curve(self) -> "altair.TopLevelMixin":
         """Mean reward so far, and the share of each policy."""
-        from osel_sim.reporting.learning_curve import run_curve
+        from osel_sim.reporting.run_page import run_curve
 
-        return run_curve(self.folder)
+        return run_curve(self.folder).chart
 
 
 @dataclass(frozen=True)
@@ -117,9 +117,9 @@ class ReplayResult:
     @cached_property
     def curve(self) -> "altair.TopLevelMixin":
         """Mean reward of every selector over decisions, with the oracles."""
-        from osel_sim.reporting.learning_curve import replay_curve
+        from osel_sim.reporting.replay_page import replay_curve
 
-        return replay_curve(self.folder)
+        return replay_curve(self.folder).chart
 
     def _table(self, name: str) -> "pandas.DataFrame":
         from osel_sim.analysis.result import tables

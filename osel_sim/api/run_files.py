@@ -1,4 +1,4 @@
-"""What a live run writes when it ends: summary, learning curve, the selector's state."""
+"""What a live run writes when it ends, beside its page: summary and the selector's state."""
 
 import logging
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,6 @@ logger = logging.getLogger(__name__)
 def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     """Write them. Returns the summary, empty where no decision was made."""
     from osel_sim.core.files import write_json
-    from osel_sim.figures import learning_curve
     from osel_sim.formats.summary import summarise
     from osel_sim.selection.state import save_state
 
@@ -26,7 +25,6 @@ def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
         summary |= _comparison(live, chosen)
     write_json(live.folder / "summary.json", summary)
     save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
-    learning_curve(live.folder / "curve.png", f"{title}, {len(chosen)} decisions", selector, policies, chosen, live.rewards)
     return summary
 
 

@@ -99,6 +99,7 @@ class Robot:
             each lifts the hand there (n,).
         nearer: metres by which its base stands nearer to the table than robosuite puts it.
         grip_site, base_site: the pose that is controlled, and the frame in which actions are given.
+        centred: metres by which a thing may be off the middle of the gripper when the scripted expert begins to close it.
         lowering: largest downward motion that the scripted expert asks of it while it puts something down, in units of action.
     """
 
@@ -114,6 +115,7 @@ class Robot:
     base_site: str = "robot0_right_center"
     wrist_camera: WristCamera = WristCamera()
     meshes: LightMeshes = LightMeshes()
+    centred: float = math.inf
     lowering: float = math.inf
 
     def __post_init__(self) -> None:

@@ -1,6 +1,6 @@
 """Section IV of the paper on a log, as figures and tables: clusters, what context is worth, trivial weights, frontiers."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -12,9 +12,13 @@ from osel_sim.analysis.estimate import mean_of
 from osel_sim.analysis.frontier import frontiers, measured
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.weights_map import Axis, TrivialRange, trivial_ranges, weights_map
-from osel_sim.reporting.description import Bars, Cell, Column, Figure, Heat, Line, Mark, Panel, Points, Table, colours
-from osel_sim.reporting.html_tables import to_text
+from osel_sim.reporting.areas import regions, shares
+from osel_sim.reporting.charts import Figure, Look, Panel, listed
+from osel_sim.reporting.curves import Line, curves
+from osel_sim.reporting.dots import Dot, Path, certain, rows, scatter
+from osel_sim.reporting.html_tables import Cell, Column, Table, to_text
 from osel_sim.reporting.log_sections import score_label
+from osel_sim.reporting.palette import colours
 from osel_sim.selection.reward import PRESETS, RewardWeights
 
 WHY_DIFFERENT = (
@@ -30,14 +34,12 @@ class Replayed:
     Attributes:
         points: of each at the weights given, as `osel_sim.analysis.frontier.measured` names it.
         swept: what they came to at others, as `osel_sim.analysis.frontier.selector_frontiers` gives it; None where that was not replayed.
-        colour: of each.
-        shown: those drawn without being asked for.
+        look: of each.
     """
 
     points: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     swept: Mapping[str, Any] | None = None
-    colour: Mapping[str, str] = field(default_factory=dict)
-    shown: Collection[str] = ()
+    look: Look = field(default_factory=lambda: Look({}))
 
 
 class Routing(NamedTuple):
@@ -66,7 +68,7 @@ def analyse(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[np.bool
 
 def cluster_blocks(log: LoggedOutcomes, routing: Routing) -> list[str | Figure | Table]:
     """Clusters with their outcome rates and optimal actions, and the paper's inequality."""
-    return [_cluster_figure(log, routing), _cluster_table(log, routing), _inequality_table(routing), WHY_DIFFERENT]
+    return [_cluster_figure(log, routing), _cluster_table(log, routing), _inequality_table(routing)]
 
 
 def weights_blocks(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[np.bool_], routing: Routing) -> list[str | Figure | Table]:
@@ -79,108 +81,115 @@ def weights_blocks(log: LoggedOutcomes, weights: RewardWeights, remote: NDArray[
     x, y, xs, ys = "alpha_time", "alpha_price (per cent)", found.alpha_time, found.alpha_price
     inside = {
         name: other
-        for name, other in {**PRESETS, "these weights": weights}.items()
+        for name, other in PRESETS.items()
         if other.time_unit == weights.time_unit and xs[0] <= other.alpha_time <= xs[-1] and ys[0] <= other.alpha_price <= ys[-1]
     }
-    points: list[Mark] = [
-        Points(name, [other.alpha_time], [other.alpha_price], "ink", size=13, symbol="star", labelled=True)
-        if name == "these weights"
-        else Points(name, [other.alpha_time], [other.alpha_price], "ink", size=9, symbol="diamond", labelled=True)
-        for name, other in inside.items()
-        if name == "these weights" or (other.alpha_time, other.alpha_price) != (weights.alpha_time, weights.alpha_price)
-    ]
+    # The weights at hand first; a preset that is the same is not named a second time.
+    here = (weights.alpha_time, weights.alpha_price)
+    marked = {"these weights": here} | {
+        name: (other.alpha_time, other.alpha_price) for name, other in inside.items() if (other.alpha_time, other.alpha_price) != here
+    }
     near = np.outer(_within_a_decade(ys, weights.alpha_price), _within_a_decade(xs, weights.alpha_time))
     most = max(float(found.gain[near].max() if near.any() else found.gain.max()), 1e-3)
-    who = Heat("instances to a remote policy (%)", xs, ys, 100 * found.remote_share, "diverging", 0, 100)
-    gain = Heat(f"mean reward gained (up to {most:.2g} or more)", xs, ys, found.gain, "sequential", 0, most)
     panels = [
-        Panel("who serves the clusters", x, y, [who, *points], True, True),
-        Panel("what routing by cluster adds", x, y, [gain, *points], True, True),
+        regions("who serves the clusters", (x, y), xs, ys, 100 * found.remote_share, 100.0, "instances to a remote policy (%)", marked),
+        regions("what routing by cluster adds", (x, y), xs, ys, found.gain, most, f"mean reward gained (up to {most:.2g} or more)", marked),
     ]
     caption = (
-        "Left: all blue and all red are the paper's trivial regions, where every cluster wants a local or a remote policy. Right: best policy of "
+        "Left: all white and all dark are the paper's trivial regions, where every cluster wants a local or a remote policy. Right: best policy of "
         "each cluster minus best policy of all, chosen and scored on the same instances; with several remote policies choosing among them can pay "
-        "where all want a remote one. Star: the weights of this report; diamonds: the paper's presets."
+        "where all want a remote one. Diamond: the weights of this report; dots: the paper's presets."
     )
-    return [Figure("weights_map", "When is routing trivial?", caption, panels), _ranges_table(weights, routing.ranges)]
+    at = int(np.abs(np.log(xs / max(here[0], xs[0]))).argmin()), int(np.abs(np.log(ys / max(here[1], ys[0]))).argmin())
+    text = (
+        f"Two maps over alpha_time and alpha_price. At the weights of this report {100 * found.remote_share[at[1], at[0]]:.0f}% of the instances lie "
+        f"in clusters best served by a remote policy, and routing by cluster adds {found.gain[at[1], at[0]]:.3f}."
+    )
+    return [Figure("weights_map", "When is routing trivial?", caption, text, panels, one_legend=False), _ranges_table(weights, routing.ranges)]
 
 
 def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routing, replayed: Replayed) -> Figure | None:
     """Success against seconds and against price as a weight sweeps; None where the log has neither."""
     tables = {name: _policy_means(table) for name, table in measured(log, weights).items()}
-    own, label, scale = colours(log.policies), *score_label(weights)
-    panels = []
+    label, scale = score_label(weights)
+    look = _frontier_look(log.policies, replayed)
+    panels: list[Panel] = []
     for found in routing.ranges:
         against = "price" if found.axis == "alpha_price" else "steps" if weights.time_unit == "steps" else "seconds"
         x_label = "mean price (cents)" if against == "price" else f"mean {against}"
         other = "alpha_price" if found.axis == "alpha_time" else "alpha_time"
-        marks: list[Mark] = []
-        for frontier, dash in zip(frontiers(log, routing.clustering.labels, weights, found.axis, found.limit), (True, False), strict=False):
-            x, texts = frontier.means[against], [f"{found.axis} {value:.3g}" for value in frontier.weights]
-            marks.append(Line(frontier.name, x, scale * frontier.means["score"], "ink", dash=dash, dots=True, texts=texts))
-        for column, policy in enumerate(log.policies):
-            if np.isfinite(tables[against][column]):
-                marks.append(
-                    Points(f"always {policy}", [tables[against][column]], [scale * tables["score"][column]], own[policy], size=11, symbol="diamond")
-                )
-        for name in replayed.points:
-            marks += _selector_marks(name, found.axis, against, scale, replayed)
+        paths: list[Path] = []
+        for frontier in frontiers(log, routing.clustering.labels, weights, found.axis, found.limit):
+            texts = [f"{found.axis} {value:.3g}" for value in frontier.weights]
+            paths.append(Path(frontier.name, frontier.means[against], scale * frontier.means["score"], texts))
+        dots = [
+            Dot(f"always {policy}", certain(float(tables[against][column])), certain(float(scale * tables["score"][column])))
+            for column, policy in enumerate(log.policies)
+            if np.isfinite(tables[against][column])
+        ]
+        for name, values in replayed.points.items():
+            paths += _swept(name, found.axis, against, scale, replayed)
+            if against in values and "score" in values:
+                dots.append(Dot(name, certain(values[against]), certain(scale * values["score"]), "these weights"))
         title = f"{found.axis} from 0 to {found.limit:.2g}, {other} = {getattr(weights, other):g}"
-        panels.append(Panel(title, x_label, label, marks))
+        panels.append(scatter(title, dots, look, (x_label, label), paths))
     if not panels:
         return None
     caption = (
-        "Black: what the hindsight oracle (dashed), and the best policy of each cluster (chosen on one half of the instances, scored on the other), "
-        "come to as one weight sweeps. Up and to the left is better."
+        "Lines without a colour: what the hindsight oracle (dashed), and the best policy of each cluster (chosen on one half of the instances, "
+        "scored on the other), come to as one weight sweeps. "
+        "Diamonds: fixed policies. Up and to the left is better. Dots that coincide stand side by side."
     )
     if replayed.points:
         caption += " Selectors: the last quarter of their streams, a large dot at these weights."
     if replayed.swept:
         streams = f"{replayed.swept['seeds']} stream{'s' if replayed.swept['seeds'] > 1 else ''}"
         caption += f" Their lines: replayed at other weights, {streams} of {replayed.swept['decisions']:,} decisions at each."
-    return Figure("frontier", f"Frontier: {label.partition(' (')[0]} against time and price", caption, panels)
+    word = label.partition(" (")[0]
+    means = [f"always {policy} {scale * value:.3g}" for policy, value in zip(log.policies, tables["score"], strict=True) if np.isfinite(value)]
+    text = f"Curves of {label} against time and price as a weight sweeps, with a dot for each fixed policy: {listed(means)}."
+    return Figure("frontier", f"Frontier: {word} against time and price", caption, text, panels, look.hidden)
 
 
-def _selector_marks(name: str, axis: Axis, against: str, scale: float, replayed: Replayed) -> list[Mark]:
-    """A selector on the frontier: a line where it was replayed at other weights, and a dot at these."""
-    colour, shown, values = replayed.colour.get(name, "muted"), name in replayed.shown, replayed.points[name]
-    marks: list[Mark] = []
+def _frontier_look(policies: Sequence[str], replayed: Replayed) -> Look:
+    own = colours(policies)
+    oracles = {"hindsight oracle": "ink", "best policy of each cluster": "ink"}
+    selectors = {name: replayed.look.colour.get(name, "muted") for name in replayed.points}
+    fixed = {f"always {policy}": own[policy] for policy in policies}
+    hidden = [name for name in replayed.points if name in replayed.look.hidden]
+    return Look(oracles | selectors | fixed, {"hindsight oracle"}, dict.fromkeys(fixed, "diamond"), hidden)
+
+
+def _swept(name: str, axis: Axis, against: str, scale: float, replayed: Replayed) -> list[Path]:
+    """What a selector came to at other weights, where that was replayed."""
     swept = (replayed.swept or {}).get(axis)
-    if swept and name in swept["selectors"]:
-        line = {key: np.array(swept["selectors"][name][key], np.float64) for key in ("score", against)}  # None becomes NaN
-        texts = [f"{name}, {axis} {value:.3g}" for value in swept["weights"]]
-        marks.append(Line(name, line[against], scale * line["score"], colour, dots=True, texts=texts, shown=shown))
-    if against in values and "score" in values:
-        marks.append(Points(name, [values[against]], [scale * values["score"]], colour, size=9, shown=shown))
-    return marks
+    if not swept or name not in swept["selectors"]:
+        return []
+    line = {key: np.array(swept["selectors"][name][key], np.float64) for key in ("score", against)}  # None becomes NaN
+    return [Path(name, line[against], scale * line["score"], [f"{axis} {value:.3g}" for value in swept["weights"]])]
 
 
 def _cluster_figure(log: LoggedOutcomes, routing: Routing) -> Figure:
     names = [_cluster_name(cluster) for cluster in routing.clusters]
-    colour = colours(log.policies)
-    rewards: list[Mark] = [Bars(policy, names, [cluster.rewards[policy] for cluster in routing.clusters], colour[policy]) for policy in log.policies]
-    parts = (
-        ("both", "both succeed", "c2"),
-        ("only_local", "only local", "c0"),
-        ("only_remote", "only remote", "c1"),
-        ("neither", "neither", "muted"),
-    )
-    rates: list[Mark] = [
-        Bars(label, names, [100 * getattr(cluster.rates, key).value for cluster in routing.clusters], shade) for key, label, shade in parts
+    rewards = {
+        policy: {name: certain(cluster.rewards[policy]) for name, cluster in zip(names, routing.clusters, strict=True)} for policy in log.policies
+    }
+    parts = {"both": "both succeed", "only_local": "only local", "only_remote": "only remote", "neither": "neither"}
+    rates = {label: [100 * getattr(cluster.rates, key).value for cluster in routing.clusters] for key, label in parts.items()}
+    shades = dict(zip(parts.values(), ("good", "good_local", "good_remote", "bad"), strict=True))
+    panels: list[Panel] = [
+        rows("mean reward", names, rewards, Look(colours(log.policies)), "mean reward"),
+        shares("outcome rates", names, rates, Look(shades), "episodes (%)"),
     ]
     scores = routing.clustering.silhouettes
-    best = routing.clustering.count
-    search: list[Mark] = [
-        Line("silhouette", list(scores), list(scores.values()), "c4"),
-        Points("taken", [best], [scores[best]] if best in scores else [max(scores.values())], "c1", size=11, symbol="star"),
-    ]
-    panels = [
-        Panel("mean reward", "", "mean reward", rewards),
-        Panel("outcome rates", "", "episodes (%)", rates, stacked=True, y_range=(0.0, 100.0)),
-        Panel("number of clusters", "clusters", "mean silhouette", search),
-    ]
+    if len(scores) > 1:
+        look = Look({"mean silhouette": "ink"})
+        line = Line("mean silhouette", list(scores.values()))
+        panels.append(curves(f"number of clusters: {routing.clustering.count} taken", list(scores), [line], look, ("clusters", "mean silhouette")))
     caption = "k-means in the leading components of the context, with the number of clusters of the highest silhouette. Largest cluster first."
-    return Figure("clusters", "Clusters in the context", caption, panels)
+    best = [f"{name}: {cluster.best}" for name, cluster in zip(names, routing.clusters, strict=True)]
+    text = f"Dots of the mean reward of each policy, and bars of outcome rates, in each of {len(names)} clusters. Best policies: {listed(best)}."
+    return Figure("clusters", "Clusters in the context", caption, text, panels, one_legend=False)
 
 
 def _cluster_table(log: LoggedOutcomes, routing: Routing) -> Table:
@@ -236,7 +245,8 @@ def _inequality_table(routing: Routing) -> Table:
     ]
     caption = (
         "Converged mean reward of the best policy of each cluster against the best policy of all (paper, section IV). On the same instances the "
-        "difference cannot be negative; held out, one half of the instances chooses and the other scores, so that it can. With a 95% interval."
+        "difference cannot be negative; held out, one half of the instances chooses and the other scores, so that it can. With a 95% interval. "
+        + WHY_DIFFERENT
     )
     return Table("inequality", "What context is worth once all is learnt", caption, columns, rows)
 

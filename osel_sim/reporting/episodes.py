@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.log import Array, LoggedOutcomes
-from osel_sim.reporting.description import digits_of, shortened
+from osel_sim.reporting.html_tables import digits_of, shortened
 from osel_sim.reporting.page import Episodes
 from osel_sim.selection.reward import RewardWeights
 
-MOST_EPISODES = 4_000
-"""So many fit into a page of a few megabytes."""
+MOST_EPISODES = 3_000
+"""So many fit into a page of two megabytes."""
 
-MOST_LETTERS = 600
-"""Of an instruction. A question of an examination can be a page long."""
+MOST_LETTERS, ALL_LETTERS = 600, 300_000
+"""Of an instruction, and of all together. A question of an examination can be a page long."""
 
 MOST_VIDEO_BYTES = 6_000_000
 """Videos up to this, all together, are put into the page; the others are linked, and must lie beside it."""
@@ -73,7 +73,11 @@ def list_episodes(
         "policy": [policy for _, policy, _ in places],
         "repeat": [repeat for _, _, repeat in places],
         "success": [_number(log.success[place], 3) for place in places],
-        **{name: [_number(values[place], _NUMBERS[name]) for place in places] for name, values in measures.items()},
+        **{
+            name: [_number(values[place], _NUMBERS[name]) for place in places]
+            for name, values in measures.items()
+            if np.isfinite(values).any()  # a log from elsewhere may know no steps
+        },
         **{name: [_number(getattr(log, name)[place], _GRADED[name]) for place in places] for name in graded(log)},
         "fallback": [found.get(place, {}).get("fallback") for place in places],
         "error": [found.get(place, {}).get("error") or ("ended in error" if log.errors[place] else None) for place in places],
@@ -83,7 +87,7 @@ def list_episodes(
         episodes["chosen"] = [int(chosen[row] == policy) for row, policy, _ in places]
     data = {
         "policies": list(log.policies),
-        "instances": [_instance(log, row, (scenes or {}).get(row)) for row in kept],
+        "instances": [_instance(log, row, (scenes or {}).get(row), min(MOST_LETTERS, ALL_LETTERS // max(1, len(kept)))) for row in kept],
         "episodes": episodes,
         "videos": _videos(videos or {}, beside),
         "digits": {
@@ -108,13 +112,13 @@ def _kept(ran: NDArray[np.bool_], pictured: set[int]) -> list[int]:
     return sorted({*np.linspace(0, total - 1, most).round().astype(int).tolist(), *pictured})
 
 
-def _instance(log: LoggedOutcomes, row: int, scene: bytes | None) -> dict[str, Any]:
+def _instance(log: LoggedOutcomes, row: int, scene: bytes | None, letters: int) -> dict[str, Any]:
     instance = log.instances[row]
     known = log.success[row][np.isfinite(log.success[row])]
     about: dict[str, Any] = {"number": row, "key": instance.key, "task": instance.task, "differ": bool(known.size and known.min() != known.max())}
     for name in ("instruction", "target", "container", "phrasing", "robot"):
         if value := getattr(instance, name):
-            about[name] = shortened(value, MOST_LETTERS)
+            about[name] = shortened(value, letters)
     # What osel_sim.report can draw with --scenes: an instance of a task file, which its seed makes again.
     if instance.seed is not None and instance.level is not None and instance.split is not None:
         about["drawable"] = True

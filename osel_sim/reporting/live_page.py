@@ -4,13 +4,14 @@ from pathlib import Path
 from typing import override
 
 from osel_sim.core.errors import OselError
+from osel_sim.core.files import write_bytes
 from osel_sim.episodes.run_subscribers import Run, RunSubscriber
-from osel_sim.reporting.page import write_page
+from osel_sim.reporting.page import FIGURES, write_page
 from osel_sim.reporting.run_page import run_page
 
 
 class LivePage(RunSubscriber):
-    """Writes `report.html` with its figures and tables into the run's folder, unless no decision was made.
+    """Writes `report.html` with its figures and tables, and `curve.png`, into the run's folder, unless no decision was made.
 
     Attributes:
         file: the page, or None where there is none.
@@ -27,5 +28,6 @@ class LivePage(RunSubscriber):
             return
         try:
             self.file = write_page(run_page(run.folder), run.folder)
+            write_bytes(run.folder / "curve.png", (run.folder / FIGURES / "curves.png").read_bytes())  # where one looks first
         except OselError as problem:
             self.problem = problem

@@ -14,6 +14,7 @@ from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, clus
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_sections import context_figure, formula, policy_blocks, rates_table, time_figure
 from osel_sim.reporting.page import Block, Page, Section, Tile, Verdict
+from osel_sim.reporting.routes import route_figure
 from osel_sim.selection.reward import RewardWeights
 
 
@@ -30,7 +31,8 @@ def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_sc
     title = f"{few(sorted(set(log.labels('task'))))}: {len(log):,} instances, {len(log.policies)} policies"
     rows, _ = read_rollouts(log.source)
     episodes = list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes(log))
-    return Page("Rollout log", title, _verdict(log, weights, routing), sections, log_facts(log, weights), episodes)
+    verdict = _verdict(log, weights, routing)
+    return Page("Rollout log", title, verdict, sections, log_facts(log, weights), episodes, route_figure(log, weights))
 
 
 def log_sections(log: LoggedOutcomes, weights: RewardWeights, replayed: Replayed | None = None) -> tuple[list[Section], Routing | None]:

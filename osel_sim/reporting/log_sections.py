@@ -1,27 +1,30 @@
 """What a rollout log says about its policies, as figures and tables."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import Literal
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.contexts import lay_out
-from osel_sim.analysis.estimate import Estimate
-from osel_sim.analysis.log import Array, LoggedOutcomes
-from osel_sim.analysis.outcomes import EVERYTHING, PolicyResult, outcome_rates, per_group
-from osel_sim.reporting.description import Bars, Column, Figure, Line, Mark, Panel, Points, Table, colours, shortened
+from osel_sim.analysis.log import LoggedOutcomes
+from osel_sim.analysis.outcomes import PolicyResult, outcome_rates, per_group
+from osel_sim.reporting.charts import Figure, Look, listed
+from osel_sim.reporting.curves import Line, curves
+from osel_sim.reporting.dots import clouds, rows
 from osel_sim.reporting.episodes import graded
+from osel_sim.reporting.html_tables import Column, Table, shortened
+from osel_sim.reporting.palette import CATEGORIES, colours
+from osel_sim.reporting.routes import WORDS, estimates, ordered
 from osel_sim.selection.reward import RewardWeights
 
 PHASES = ("upload", "inference", "download", "motion")
 _BINS = 40
-_MOST_BARS = 14
-"""So many groups are drawn as bars side by side; more, as the subjects of a large table, as a row each."""
+_MOST_LETTERS = 40
+"""Of an instruction, in what the page says of a dot."""
 
 _CLOUD_COLOURS = 12
-"""The first colours differ enough to be told apart by single dots. With two symbols they are enough for twice as many groups."""
+"""The first colours differ enough to be told apart by single dots. With two shapes they are enough for twice as many groups."""
 
 
 def formula(weights: RewardWeights) -> str:
@@ -38,11 +41,13 @@ def score_label(weights: RewardWeights) -> tuple[str, float]:
 
 def policy_blocks(log: LoggedOutcomes, weights: RewardWeights) -> list[Figure | Table]:
     """Success and reward of each policy by task, and by what was asked where the log knows (paper, figures 3 and 4)."""
-    blocks: list[Figure | Table] = [
-        _policy_table("policies", "Policies" if len(set(log.labels("task"))) == 1 else "Policies by task", per_group(log, weights, "task"), log)
-    ]
-    for attribute, word in (("task", "task"), ("robot", "robot"), ("target", "object asked for")):
+    several = len(set(log.labels("task"))) > 1
+    title = "Policies by task" if several else "Policies"
+    blocks: list[Figure | Table] = []
+    for attribute, word in WORDS.items():
         results = per_group(log, weights, attribute)
+        if attribute == "task":
+            blocks.append(_policy_table("policies", title, results, log))
         if len({result.group for result in results}) == 1:
             continue
         blocks.append(_policy_figure(f"policies_by_{attribute}", f"Success and reward by {word}", results, log.policies))
@@ -70,52 +75,53 @@ def rates_table(log: LoggedOutcomes, remote: NDArray[np.bool_], why: str) -> Tab
 def context_figure(log: LoggedOutcomes, weights: RewardWeights) -> Figure | None:
     """t-SNE of the contexts by everything that could explain how they lie."""
     layout = lay_out(log, weights)
-    if layout is None:
+    if layout is None or not layout.labels:
         return None
-    instructions = [shortened(instance.instruction or instance.key, 80) for instance in (log.instances[row] for row in layout.rows)]
-    panels = []
+    about = [shortened(instance.instruction or instance.key, _MOST_LETTERS) for instance in (log.instances[row] for row in layout.rows)]
+    aspects = {}
     for aspect, labels in layout.labels.items():
-        own = colours([*log.policies, *sorted(set(labels) - set(log.policies))]) if aspect == "best policy" else None
-        panels.append(Panel(f"by {aspect}", "", "", _clouds(layout.places, labels, instructions, own), bare=True))
-    if not panels:
-        return None
+        if aspect == "best policy":
+            known = [policy for policy in log.policies if policy in labels]
+            look, names = (
+                Look({name: colours(log.policies)[name] for name in known} | dict.fromkeys(sorted(set(labels) - set(known)), "muted")),
+                list(labels),
+            )
+        else:
+            look, names = _groups([label or "(none)" for label in labels], len(log.policies))
+        aspects[f"by {aspect}"] = (names, look)
+    panels = clouds(layout.places, (about, layout.rows.tolist()), aspects)
     caption = (
         f"Contexts of {len(layout.rows):,} instances laid out by t-SNE; encoder {log.encoder}. Points that lie together look alike to the selector: "
-        "where they also share their best policy, context can help."
+        "where they also share their best policy, context can help. A click on one shows its episodes."
     )
     if {"several", "unknown"} & set(layout.labels.get("best policy", ())):
         caption += " Best policy: 'several' is a tie, 'unknown' a missing outcome."
-    return Figure("contexts", "What the selector sees", caption, panels)
+    sizes = [f"{aspect} ({len(set(labels))})" for aspect, labels in layout.labels.items()]
+    text = f"{len(layout.rows):,} dots, one for each context, near one another where contexts are alike; coloured by {listed(sizes)} in turn."
+    return Figure("contexts", "What the selector sees", caption, text, panels, one_legend=False)
 
 
-def _clouds(places: Array, labels: Sequence[str], texts: Sequence[str], own: Mapping[str, str] | None) -> list[Mark]:
-    """Points (M, 2) by their labels; of more groups than can be told apart the largest, and the rest muted.
-
-    Args:
-        own: colour of each label, where these are policies, which have theirs everywhere.
+def _groups(labels: Sequence[str], policies: int) -> tuple[Look, list[str]]:
+    """How groups of dots are drawn, in colours that no policy has, and the name (n,) each dot goes by: of more groups than can be told apart the
+    largest, and the rest muted.
     """
     sizes = Counter(labels)
     groups = sorted(sizes, key=lambda value: (-sizes[value], value))
-    if own is None and len(groups) > 2 * _CLOUD_COLOURS:
-        groups = groups[: _CLOUD_COLOURS - 1]
-    rest = {f"{len(sizes) - len(groups)} others": set(sizes) - set(groups)} if len(groups) < len(sizes) else {}
-    marks: list[Mark] = []
-    # The muted rest comes first, below the others.
-    for name, values in (rest | {value: {value} for value in sorted(groups)}).items():
-        number = len(marks) - len(rest)
-        colour = own[name] if own else "muted" if name in rest else f"c{number % _CLOUD_COLOURS}"
-        rows = np.array([label in values for label in labels])
-        about = [f"{text}: {label}" for text, label, inside in zip(texts, labels, rows, strict=True) if inside]
-        x, y = places[rows].T
-        symbol: Literal["circle", "x"] = "x" if own is None and number >= _CLOUD_COLOURS else "circle"
-        marks.append(Points(name if own else name.replace("_", " "), x, y, colour, about, size=4 if name in rest else 5, symbol=symbol))
-    return marks
+    most = max(2, min(_CLOUD_COLOURS, CATEGORIES - policies))
+    if len(groups) > 2 * most:
+        groups = groups[: most - 1]
+    rest = f"{len(sizes) - len(groups)} others"
+    kept = sorted(groups)
+    colour = {name: f"c{(policies + place % most) % CATEGORIES}" for place, name in enumerate(kept)}
+    shapes = {name: "triangle-up" for name in kept[most:]}
+    others = {rest: "muted"} if len(groups) < len(sizes) else {}
+    return Look(colour | others, shapes=shapes), [label if label in colour else rest for label in labels]
 
 
 def time_figure(log: LoggedOutcomes) -> Figure | None:
     """Distributions of upload, inference, download and motion time (paper, appendix A)."""
-    colour = colours(log.policies)
-    panels = []
+    panels, seconds = [], []
+    look = Look(colours(log.policies))
     for phase in PHASES:
         values = getattr(log, phase)
         known = [values[:, column][np.isfinite(values[:, column])] for column in range(len(log.policies))]
@@ -124,17 +130,19 @@ def time_figure(log: LoggedOutcomes) -> Figure | None:
             continue
         together = np.concatenate([own for _, own in used])
         edges = np.histogram_bin_edges(together, _bins(together.size))
-        marks = [Line(policy, edges, [*(100 * np.histogram(own, edges)[0] / own.size), 0.0], colour[policy], steps=True) for policy, own in used]
-        panels.append(Panel(phase, "seconds an episode", "episodes (%)", marks))
+        lines = [Line(policy, [*(100 * np.histogram(own, edges)[0] / own.size), 0.0]) for policy, own in used]
+        panels.append(curves(phase, edges, lines, look, ("seconds an episode", "episodes (%)"), steps=True))
+        seconds.append(f"{phase} " + ", ".join(f"{policy} {own.mean():.2g}" for policy, own in used))
     if not panels:
         return None
     own = any(instance.seed is not None for instance in log.instances)
     caption = f"Sums over an episode{', on the virtual clock' if own else ', as the log has them'}."
-    if own and {panel.title for panel in panels} & {"upload", "download"}:
+    if own and any(text.startswith(("upload", "download")) for text in seconds):
         caption += " Policies without network take no time for upload or download, and are not drawn there."
     if own and np.isfinite(log.motion).any():
         caption += " The robot waits while an answer is on its way, so motion contains the other three."
-    return Figure("times", "Where the time goes", caption, panels)
+    text = f"Histograms of seconds an episode by policy. Means: {listed(seconds)}."
+    return Figure("times", "Where the time goes", caption, text, panels)
 
 
 def _bins(count: int) -> int:
@@ -158,63 +166,20 @@ def _policy_table(name: str, title: str, results: Sequence[PolicyResult], log: L
 
 
 def _policy_figure(name: str, title: str, results: Sequence[PolicyResult], policies: Sequence[str]) -> Figure:
-    groups = list(dict.fromkeys(result.group for result in results))
-    if len(groups) > _MOST_BARS:
-        return _policy_rows(name, title, results, policies)
-    colour = colours(policies)
-    panels = []
-    for measure, label in (("success", "success"), ("reward", "mean reward")):
-        marks = []
-        for policy in policies:
-            own = {result.group: getattr(result, measure) for result in results if result.policy == policy}
-            found: list[tuple[str, Estimate]] = [(group, own[group]) for group in groups if own.get(group) is not None]
-            names = [_group_name(group) for group, _ in found]
-            values, low, high = ([getattr(estimate, end) for _, estimate in found] for end in ("value", "low", "high"))
-            marks.append(Bars(policy, names, values, colour[policy], low, high))
-        panels.append(Panel(label, "", label, marks, y_range=(0.0, 1.02) if measure == "success" else None))
-    caption = "With 95% intervals. Where the order of the policies changes from group to group, there is something to route by."
-    return Figure(name, title, caption, panels)
-
-
-def _policy_rows(name: str, title: str, results: Sequence[PolicyResult], policies: Sequence[str]) -> Figure:
     """A row for each group; first those in which the best policy of all is behind another one."""
-    found = {(result.group, result.policy): result for result in results}
-    groups = [group for group in dict.fromkeys(result.group for result in results) if group != EVERYTHING]
-
-    def reward(group: str, policy: str) -> float:
-        mean = found[group, policy].reward
-        return mean.value if mean is not None else np.nan
-
-    best = max(policies, key=lambda policy: np.nan_to_num(reward(EVERYTHING, policy), nan=-np.inf))
-    others = [policy for policy in policies if policy != best]
-    # Of each group how far the best of all is ahead of the best other one; infinite, and so last, where there is none to compare with.
-    ahead = {group: reward(group, best) - np.fmax.reduce([-np.inf, *(reward(group, policy) for policy in others)]) for group in groups}
-    ahead = {group: value if np.isfinite(value) else np.inf for group, value in ahead.items()}
-    rows = [EVERYTHING, *sorted(groups, key=lambda group: ahead[group])]
-    names, colour = [_group_name(group) for group in rows], colours(policies)
-    panels = []
-    for measure, label in (("success", "success"), ("reward", "mean reward")):
-        marks: list[Mark] = []
-        for number, policy in enumerate(policies):
-            known = [(row, estimate) for row, group in enumerate(rows) if (estimate := getattr(found[group, policy], measure)) is not None]
-            values, low, high = ([getattr(estimate, end) for _, estimate in known] for end in ("value", "low", "high"))
-            # A little apart, so that an interval does not cover another.
-            y = [row + 0.6 * ((number + 0.5) / len(policies) - 0.5) for row, _ in known]
-            ends = zip(known, values, low, high, strict=True)
-            texts = [f"{names[row]}, {policy}: {value:.3f} [{start:.3f}, {end:.3f}]" for (row, _), value, start, end in ends]
-            marks.append(Points(policy, values, y, colour[policy], texts, x_interval=(low, high), size=7))
-        panels.append(Panel(label, "", "", marks, rows=names))
-    behind = sum(value < 0.0 for value in ahead.values())
-    caption = "With 95% intervals. "
-    if others:
+    groups, look = ordered(results, policies), Look(colours(policies))
+    panels = [
+        rows("success", groups.names, estimates(results, "success"), look, "success", percent=True),
+        rows("mean reward", groups.names, estimates(results, "reward"), look, "mean reward"),
+    ]
+    count = len(groups.names) - 1
+    caption = "With 95% intervals."
+    if len(policies) > 1 and count:
+        place = f"in the first {groups.behind} of {count} groups it is behind" if groups.behind else f"it is in all {count} groups"
         caption += (
-            f"Ordered by how far {best}, the best over all, is ahead of the best other policy in mean reward: in the first {behind} of {len(groups)} "
-            "groups it is behind. Where it is so by more than the intervals, there is something to route by."
-            if behind
-            else f"Ordered by how far {best}, the best over all, is ahead of the best other policy in mean reward: it is in all {len(groups)} groups."
+            f" Ordered by how far {groups.best}, the best over all, is ahead of the best other policy in mean reward: {place}. "
+            "Where another is ahead by more than the intervals, there is something to route by."
         )
-    return Figure(name, title, caption, panels)
-
-
-def _group_name(group: str) -> str:
-    return group.replace("_", " ") if group != EVERYTHING else "all"
+    means = [f"{result.policy} {result.reward.value:.3f}" for result in results if result.group == groups.names[0] and result.reward is not None]
+    text = f"Dots with intervals, a row for each of {count or 1} groups, a colour for each policy. Mean reward over all: {listed(means)}."
+    return Figure(name, title, caption, text, panels)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from osel_sim.analysis.estimate import Estimate
-from osel_sim.reporting.description import Cell, Column, Table
+from osel_sim.reporting.html_tables import Cell, Column, Table
 
 
 def off_policy_table(found: Mapping[str, Any]) -> Table:

@@ -3,20 +3,18 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
-from osel_sim.core.errors import UsageError
 from osel_sim.core.files import write_bytes
 from osel_sim.core.shown import all_shown, shown
-from osel_sim.reporting.description import DARK, LIGHT, Figure, Table
-from osel_sim.reporting.html_tables import to_csv, to_text
+from osel_sim.reporting.charts import Figure, to_images
+from osel_sim.reporting.html_tables import Table, to_csv, to_parts
+from osel_sim.reporting.palette import DARK, LIGHT
 
 PAGE, FIGURES, TABLES = "report.html", "figures", "tables"
-ROW_HEIGHT = 22
-"""Pixels of a row of a panel that has named rows."""
-
 Block = str | Figure | Table
 
 
@@ -84,6 +82,7 @@ class Page:
     Attributes:
         kind: what it reports on: a replay, a live run, a rollout log.
         facts: what it was made from.
+        routes: what goes where; it stands below the verdict, all else folds.
     """
 
     kind: str
@@ -92,19 +91,18 @@ class Page:
     sections: Sequence[Section]
     facts: Sequence[tuple[str, str]]
     episodes: Episodes | None = None
+    routes: Figure | None = None
     figures: Sequence[Figure] = field(init=False)
     tables: Sequence[Table] = field(init=False)
 
     def __post_init__(self) -> None:
-        blocks = [block for section in self.sections for block in section.blocks]
+        blocks = [*([self.routes] if self.routes else []), *(block for section in self.sections for block in section.blocks)]
         object.__setattr__(self, "figures", tuple(block for block in blocks if isinstance(block, Figure)))
         object.__setattr__(self, "tables", tuple(block for block in blocks if isinstance(block, Table)))
 
 
 def write_page(page: Page, folder: Path) -> Path:
     """Write `figures/`, `tables/` and last `report.html` into a folder. Each file appears at once or not at all, and none if one cannot be made."""
-    from osel_sim.reporting.matplotlib_figures import to_images
-
     files = {f"{FIGURES}/{figure.name}.{ending}": image for figure in page.figures for ending, image in to_images(figure).items()}
     files |= {f"{TABLES}/{table.name}.csv": to_csv(table).encode() for table in page.tables}
     files[PAGE] = to_html(page).encode()
@@ -120,36 +118,33 @@ def to_html(page: Page) -> str:
     from jinja2 import Environment, StrictUndefined
     from markupsafe import Markup
 
-    from osel_sim.reporting.plotly_figures import to_plotly
-
     template = resources.files("osel_sim.reporting") / "template"
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalize)
     data = {
         "palette": {"light": LIGHT, "dark": DARK},
-        "figures": {figure.name: to_plotly(figure) for figure in page.figures},
+        "figures": {figure.name: figure.spec for figure in page.figures},
         "episodes": page.episodes.data if page.episodes else None,
     }
+    environment.filters["shown"] = shown
     return environment.from_string((template / "report.html.j2").read_text(encoding="utf-8")).render(
         page=page,
-        text=to_text,
-        row_height=ROW_HEIGHT,
+        parts=to_parts,
         light=LIGHT,
         dark=DARK,
         css=Markup((template / "report.css").read_text(encoding="utf-8")),
         script=Markup((template / "report.js").read_text(encoding="utf-8")),
-        plotly=Markup(_plotly()),
+        vega=Markup(_vega()),
         data=Markup(_embedded(data)),
     )
 
 
-def _plotly() -> str:
-    """plotly.js, as the plotly package ships it. Read as a file: importing the package takes a second, and nothing else of it is needed."""
-    import importlib.util
+@cache
+def _vega() -> str:
+    """Vega, Vega-Lite and vega-embed as one script, as vl-convert brings them. It names what it defines globally, hence the function around it."""
+    import vl_convert
 
-    found = importlib.util.find_spec("plotly")
-    if found is None or found.origin is None:
-        raise UsageError("the report needs the package plotly: pip install plotly")
-    return (Path(found.origin).parent / "package_data" / "plotly.min.js").read_text(encoding="utf-8")
+    script = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")
+    return f"(() => {{{script}}})();".replace("</script", "<\\/script")
 
 
 def _finalize(value: Any) -> Any:

@@ -1,6 +1,7 @@
 """The page of a replay."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,23 +17,24 @@ from osel_sim.analysis.oracles import oracles
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.replay_result import REPLAY, Choices, read_replay
 from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.reporting.charts import Figure, Look
 from osel_sim.reporting.cluster_sections import Replayed
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_page import bounds, few, log_facts, log_sections, signed
 from osel_sim.reporting.off_policy_section import off_policy_table
 from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
 from osel_sim.reporting.replay_tables import SINGLES, gaps, oracle_table, paired_tables, selector_table
+from osel_sim.reporting.routes import Chosen, route_figure
 from osel_sim.reporting.selector_sections import (
     MAIN,
     ORACLES,
     Stream,
-    Style,
     curve_figure,
     gap_figure,
+    look_of,
     penalty_figure,
     regret_figure,
     share_figure,
-    style_of,
 )
 from osel_sim.selection.reward import RewardWeights
 
@@ -58,38 +60,102 @@ def replay_page(folder: Path, options: ReplayOptions) -> Page:
     Raises:
         DataError: no replay there, or its log is missing or is another one.
     """
-    result, choices = read_replay(folder)
+    with _promised_form(folder):
+        return _page(_read(folder, options.log), options.scenes)
+
+
+def replay_curve(folder: Path) -> Figure:
+    """The learning curves of a replay's folder, as its page has them.
+
+    Raises:
+        DataError: no replay there, or its log is missing or is another one.
+    """
+    with _promised_form(folder):
+        replay = _read(folder, None)
+        return curve_figure(replay.streams, replay.look)
+
+
+@dataclass(frozen=True)
+class _Replay:
+    """What lies in a replay's folder, and what follows from it.
+
+    Attributes:
+        log: the instances of the choices, in their order.
+        names: selector -> what it is called on the page.
+        streams: what each selector and oracle received, by its name on the page.
+        learnable: oracle that bounds what can be learned, by its name on the page.
+    """
+
+    folder: Path
+    result: Mapping[str, Any]
+    choices: Choices
+    log: LoggedOutcomes
+    weights: RewardWeights
+    names: Mapping[str, str]
+    streams: Mapping[str, Stream]
+    look: Look
+    learnable: str
+
+    @property
+    def learners(self) -> dict[str, str]:
+        """Selectors that are no fixed policies, with their names on the page."""
+        return {name: shown for name, shown in self.names.items() if not name.startswith("fixed:")}
+
+
+@contextmanager
+def _promised_form(folder: Path) -> Iterator[None]:
     try:
-        return _page(folder, result, choices, options)
+        yield
     except (KeyError, TypeError, IndexError) as error:
         raise DataError(f"{folder / REPLAY}: does not have the promised form ({error!r})") from None
 
 
-def _page(folder: Path, result: Mapping[str, Any], choices: Choices, options: ReplayOptions) -> Page:
-    log = _log(folder, result, choices, options.log)
+def _read(folder: Path, log_folder: Path | None) -> _Replay:
+    result, choices = read_replay(folder)
+    log = _log(folder, result, choices, log_folder)
     weights = RewardWeights(**{key: value for key, value in result["reward"].items() if key != "preset"})
     names = _names(result)
     streams = _streams(log, weights, choices, names)
     always = {shown: name.removeprefix("fixed:") for name, shown in names.items() if name.startswith("fixed:")}
-    stake = result["verdict"]["stake"]
     learnable = ORACLES[result["learnable_oracle"]["name"]]
-    style = style_of(list(streams), log.policies, always, {*_ends(result, names), names.get(str(stake.get("selector")), "")}, learnable)
-    learners = {shown: streams[shown] for name, shown in names.items() if not name.startswith("fixed:")}
-    selectors: list[Block] = [curve_figure(streams, style), selector_table(result, names)]
-    gap = gap_figure({names[name]: gaps(entry) for name, entry in result["selectors"].items() if entry["kind"] == "learner"}, learnable)
-    regret = regret_figure(streams, [*_ends(result, names)[:1], *(word for word in ORACLES.values() if word in streams)], style)
-    shares = share_figure(learners, log.policies, style)
-    selectors += [block for block in (gap, regret, penalty_figure(streams, weights, style), shares) if block is not None]
+    keep = {*_ends(result, names), names.get(_speaker(result), ""), names.get(str(result["verdict"]["stake"].get("selector")), "")}
+    look = look_of(list(streams), log.policies, always, keep, learnable)
+    return _Replay(folder, result, choices, log, weights, names, streams, look, learnable)
+
+
+def _page(replay: _Replay, scenes: Scenes) -> Page:
+    result, choices, log, names, streams = replay.result, replay.choices, replay.log, replay.names, replay.streams
+    weights, look, learners = replay.weights, replay.look, replay.learners
+    selectors: list[Block] = [curve_figure(streams, look), selector_table(result, names)]
+    gap = gap_figure({names[name]: gaps(entry) for name, entry in result["selectors"].items() if entry["kind"] == "learner"}, replay.learnable)
+    regret = regret_figure(streams, [*_ends(result, names)[:1], *(word for word in ORACLES.values() if word in streams)], look)
+    shares = share_figure({shown: streams[shown] for shown in learners.values()}, log.policies, look)
+    selectors += [block for block in (gap, regret, penalty_figure(streams, weights, look), shares) if block is not None]
     selectors += [oracle_table(result), *paired_tables(result, names)]
     selectors += [off_policy_table(result["off_policy"])] if result.get("off_policy") else []
-    points = _points(log, weights, choices, {name: shown for name, shown in names.items() if not name.startswith("fixed:")})
-    replayed = Replayed(points, result.get("frontier"), style.colour, style.shown)
-    shared, _ = log_sections(log, weights, replayed)
+    shared, _ = log_sections(log, weights, Replayed(_points(log, weights, choices, learners), result.get("frontier"), look))
     title = f"{few(result['log']['tasks'])}: {len(learners)} selectors over {choices.order.shape[1]:,} decisions, {len(choices.order)} seeds"
-    episodes = _episodes(log, weights, choices, names, style, options.scenes(log))
-    return Page(
-        "Replay", title, _verdict(result), [Section("selectors", "Selectors", selectors), *shared], _facts(folder, result, log, weights), episodes
-    )
+    who = _speaker(result)
+    routes = route_figure(log, weights, _chosen(choices, who, names) if who in names else None)
+    sections = [Section("selectors", "Selectors", selectors), *shared]
+    facts, episodes = _facts(replay.folder, result, log, weights), _episodes(log, weights, choices, names, look, scenes(log))
+    return Page("Replay", title, _verdict(result), sections, facts, episodes, routes)
+
+
+def _speaker(result: Mapping[str, Any]) -> str:
+    """The selector that the verdict is about; where it names none, the best one that learns; empty where none does."""
+    found = result["verdict"].get("selector") or result["verdict"]["stake"].get("selector")
+    learners = [name for name, entry in result["selectors"].items() if entry["kind"] == "learner"]
+    if found in learners or not learners:
+        return str(found or "")
+    return str(max(learners, key=lambda name: float(result["selectors"][name]["mean_reward"])))
+
+
+def _chosen(choices: Choices, who: str, names: Mapping[str, str]) -> Chosen:
+    """Whom it chose in the last quarter of its streams, once it has learnt."""
+    late = slice(choices.order.shape[1] * 3 // 4, None)
+    columns = choices.chosen[who][:, late].astype(np.int64)
+    return Chosen(names[who], choices.order[:, late].astype(np.int64), columns, f" in the last quarter of its {len(choices.order)} streams")
 
 
 def _log(folder: Path, result: Mapping[str, Any], choices: Choices, log_folder: Path | None) -> LoggedOutcomes:
@@ -188,11 +254,11 @@ def _facts(folder: Path, result: Mapping[str, Any], log: LoggedOutcomes, weights
 
 
 def _episodes(
-    log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str], style: Style, scenes: Mapping[int, bytes]
+    log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str], look: Look, scenes: Mapping[int, bytes]
 ) -> Episodes:
     rows = [] if is_live_run(log.source) else read_rollouts(log.source)[0]
     learners = [name for name in names if not name.startswith("fixed:") and name != "random"]
-    kept: Sequence[str] = sorted(learners, key=lambda name: (name not in MAIN, names[name] not in style.shown))[:_MOST_PICKS]
+    kept: Sequence[str] = sorted(learners, key=lambda name: (name not in MAIN, names[name] in look.hidden))[:_MOST_PICKS]
     return list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes, picks={names[name]: _picks(choices, name) for name in kept})
 
 

@@ -17,14 +17,17 @@ from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, read_journal
 from osel_sim.formats.run_config import RUN
-from osel_sim.reporting.description import Cell, Column, Figure, Line, Mark, Panel, Table, colours, thinned
+from osel_sim.reporting.charts import Figure, Look, listed
+from osel_sim.reporting.curves import Line, curves, thinned
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes
-from osel_sim.reporting.html_tables import to_text
+from osel_sim.reporting.html_tables import Cell, Column, Table, to_text
 from osel_sim.reporting.log_page import few, interval, log_sections, signed
 from osel_sim.reporting.log_sections import formula
 from osel_sim.reporting.off_policy_section import off_policy_table
 from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
-from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, penalty_figure, regret_figure, share_figure, style_of
+from osel_sim.reporting.palette import colours
+from osel_sim.reporting.routes import Chosen, route_figure
+from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, look_of, penalty_figure, regret_figure
 from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
 from osel_sim.statistics.betting import advantage_bounds
 
@@ -47,23 +50,35 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     run = _read(folder)
     selector = run.live.selector
     streams = _streams(run, selector)
-    style = style_of(list(streams), run.log.policies, {f"always {policy}": policy for policy in run.log.policies})
-    curves: list[Block] = [curve_figure(streams, style)]
+    look = _look(run, streams)
+    blocks: list[Block] = [curve_figure(streams, look, run.log.policies)]
     if HINDSIGHT in streams:
-        curves += [regret_figure(streams, [HINDSIGHT], style), penalty_figure(streams, run.weights, style)]
-    shares = share_figure({selector: streams[selector]}, run.log.policies, style)
-    curves += [shares] if shares else []
-    curves += [_propensities(run), _chosen_table(run, selector)]
+        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look)]
+    blocks += [_propensities(run), _chosen_table(run, selector)]
     if any(decision.reward is not None for decision in run.decisions):
-        curves.append(off_policy_table(evaluate(run.live, run.weights)))
-    sections = [Section("curves", "Learning", curves)]
+        blocks.append(off_policy_table(evaluate(run.live, run.weights)))
+    sections = [Section("curves", "Learning", blocks)]
     try:
         sections += log_sections(run.log, run.weights)[0]
     except DataError as error:  # a run without counterfactual knows too little for some tables
         sections.append(Section("policies", "Policies", [f"Not looked at: {error}."]))
     decisions = f"{len(run.decisions)} decision" + ("s" if len(run.decisions) != 1 else "")
     title = f"{few(sorted(set(run.log.labels('task'))))}: {selector} over {decisions}"
-    return Page("Live run", title, _verdict(run, selector, streams), sections, _facts(run), _episodes(run, scenes(run.log), beside or folder))
+    chosen = Chosen(selector, np.arange(len(run.chosen))[None], run.chosen[None], " of this run")
+    routes = route_figure(run.log, run.weights, chosen)
+    episodes = _episodes(run, scenes(run.log), beside or folder)
+    return Page("Live run", title, _verdict(run, selector, streams), sections, _facts(run), episodes, routes)
+
+
+def run_curve(folder: Path) -> Figure:
+    """The learning curve of a live run's folder, as its page has it.
+
+    Raises:
+        DataError: no run there, or no decision in it.
+    """
+    run = _read(folder)
+    streams = _streams(run, run.live.selector)
+    return curve_figure(streams, _look(run, streams), run.log.policies)
 
 
 @dataclass(frozen=True)
@@ -118,14 +133,19 @@ def _streams(run: _Run, selector: str) -> dict[str, Stream]:
     return streams
 
 
+def _look(run: _Run, streams: Mapping[str, Stream]) -> Look:
+    return look_of(list(streams), run.log.policies, {f"always {policy}": policy for policy in run.log.policies})
+
+
 def _propensities(run: _Run) -> Figure:
     at = thinned(len(run.decisions))
-    colour = colours(run.log.policies)
-    marks: list[Mark] = []
-    for policy in run.log.policies:
-        marks.append(Line(policy, at + 1, [run.decisions[index].propensities.get(policy, 0.0) for index in at], colour[policy]))
+    propensities = run.live.propensities
+    lines = [Line(policy, propensities[at, column]) for column, policy in enumerate(run.log.policies)]
+    panel = curves("", at + 1, lines, Look(colours(run.log.policies)), ("decision", "propensity"), (-0.02, 1.02))
     caption = "Probability with which the selector would choose each policy, as it stood when it decided. Off-policy estimates build on these."
-    return Figure("propensities", "How sure the selector is", caption, [Panel("", "decision", "propensity", marks, y_range=(-0.02, 1.02))])
+    last = [f"{policy} {value:.2f}" for policy, value in zip(run.log.policies, propensities[-1], strict=True)]
+    text = f"Curves of the probability with which each policy would be chosen. In the last decision: {listed(last)}."
+    return Figure("propensities", "How sure the selector is", caption, text, [panel])
 
 
 def _chosen_table(run: _Run, selector: str) -> Table:

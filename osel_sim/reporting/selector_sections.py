@@ -8,8 +8,12 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.log import Array
-from osel_sim.reporting.description import Bars, Figure, Line, Mark, Panel, Points, colours, thinned
+from osel_sim.reporting.areas import stacked
+from osel_sim.reporting.charts import Figure, Look, Panel, listed
+from osel_sim.reporting.curves import Line, curves, settled_domain, thinned
+from osel_sim.reporting.dots import Dot, certain, rows, scatter
 from osel_sim.reporting.log_sections import score_label
+from osel_sim.reporting.palette import colours
 from osel_sim.selection.reward import RewardWeights
 
 MAIN = ("auto:warm", "auto", "ppo", "ppo_tuned", "epsilon_greedy", "random")
@@ -18,19 +22,6 @@ MAIN = ("auto:warm", "auto", "ppo", "ppo_tuned", "epsilon_greedy", "random")
 ORACLES = {"hindsight": "hindsight oracle", "expected": "expected oracle", "predictable": "predictable oracle", "per_task": "per-task oracle"}
 _FEW = 8
 _NORMAL = 1.959964
-
-
-@dataclass(frozen=True)
-class Style:
-    """How each way of choosing is drawn.
-
-    Attributes:
-        colour: of each name.
-        shown: drawn without being asked for.
-    """
-
-    colour: Mapping[str, str]
-    shown: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -52,7 +43,7 @@ class Stream:
     chosen: NDArray[np.int64] | None = None
 
 
-def style_of(names: Sequence[str], policies: Sequence[str], always: Mapping[str, str], keep: Collection[str] = (), learnable: str = "") -> Style:
+def look_of(names: Sequence[str], policies: Sequence[str], always: Mapping[str, str], keep: Collection[str] = (), learnable: str = "") -> Look:
     """Colours: a fixed policy has its policy's, hindsight and learnable oracle are ink, other oracles muted, all others have one of their own.
 
     Args:
@@ -66,10 +57,10 @@ def style_of(names: Sequence[str], policies: Sequence[str], always: Mapping[str,
     # Those shown first: colours repeat, and two that are seen together must not share one.
     others = sorted((name for name in names if name not in always and name not in oracles), key=lambda name: name not in shown)
     own = colours([*policies, *others])
-    colour = (
-        {name: own.get(name, "muted") for name in names} | {name: of_policy[policy] for name, policy in always.items()} | dict.fromkeys(bounds, "ink")
-    )
-    return Style(colour, frozenset(shown))
+    colour = {name: own.get(name, "muted") for name in names} | {name: of_policy[policy] for name, policy in always.items()}
+    colour |= {name: "ink" for name in names if name in bounds}
+    shapes = {name: "diamond" for name in always} | dict.fromkeys(oracles, "cross")
+    return Look(colour, {ORACLES["hindsight"], ORACLES["predictable"]}, shapes, {name for name in names if name not in shown})
 
 
 def running_mean(values: Array) -> Array:
@@ -79,77 +70,84 @@ def running_mean(values: Array) -> Array:
     return np.where(count > 0, np.where(known, values, 0.0).cumsum(axis=-1) / np.maximum(count, 1), np.nan)
 
 
-def curve_figure(streams: Mapping[str, Stream], style: Style) -> Figure:
-    """Cumulative mean reward over decisions with bands over seeds (paper, figure 5)."""
+def curve_figure(streams: Mapping[str, Stream], look: Look, policies: Sequence[str] = ()) -> Figure:
+    """Cumulative mean reward over decisions with bands over seeds (paper, figure 5).
+
+    Args:
+        policies: of a single selector: those it chose among, to show beside the curves how often it chose each.
+    """
     seeds = max(len(stream.reward) for stream in streams.values())
-    marks = _lines({name: running_mean(stream.reward) for name, stream in streams.items()}, style)
+    at, lines = _lines({name: running_mean(stream.reward) for name, stream in streams.items()})
+    domain = settled_domain(at + 1, [line for line in lines if line.name not in look.hidden])
+    panels: list[Panel] = [curves("", at + 1, lines, look, ("decision", "mean reward so far"), domain)]
+    chosen = _shares(streams, len(policies)) if len(policies) > 1 else {}
+    for name, shares in chosen.items():
+        parts = {policy: shares[column][at] for column, policy in enumerate(policies)}
+        panels.append(stacked("", at + 1, parts, Look(colours(policies)), ("decision", f"chosen by {name} (%)")))
     band = f" Bands: 95% intervals of the mean over {seeds} seeds." if seeds > 1 else ""
     caption = f"Mean of the rewards up to each decision (the paper's figure 5).{band} Click a name to hide or show it."
-    panel = Panel("", "decision", "mean reward so far", marks, y_range=_settled_range(marks))
-    return Figure("curves", "Learning curves", caption, [panel])
+    caption += " Right: share of the latest tenth of the decisions in which each policy was chosen." if chosen else ""
+    ends = sorted(((float(np.asarray(line.y)[-1]), line.name) for line in lines), reverse=True)
+    text = f"Curves of the mean reward over {int(at[-1]) + 1:,} decisions. At the end: {listed([f'{name} {value:.3f}' for value, name in ends])}."
+    return Figure("curves", "Learning curves", caption, text, panels, look.hidden, one_legend=False)
 
 
-def regret_figure(streams: Mapping[str, Stream], references: Sequence[str], style: Style) -> Figure:
+def regret_figure(streams: Mapping[str, Stream], references: Sequence[str], look: Look) -> Figure:
     """Cumulative regret: what each of the references (names of streams) would have received more."""
-    panels = []
+    panels, ends = [], []
+    own = look.only([name for name in streams if name not in ORACLES.values()])
     for reference in references:
         base = streams[reference].reward
-        regrets = {
-            name: np.nan_to_num(base - stream.reward).cumsum(axis=-1)
-            for name, stream in streams.items()
-            if name not in ORACLES.values() and name != reference
-        }
-        panels.append(Panel(f"to {reference}", "decision", "cumulative regret (reward)", _lines(regrets, style)))
+        regrets = {name: np.nan_to_num(base - streams[name].reward).cumsum(axis=-1) for name in own.names if name != reference}
+        at, lines = _lines(regrets)
+        panels.append(curves(f"to {reference}", at + 1, lines, own, ("decision", "cumulative regret (reward)")))
+        ends += [f"{name} to {reference} {float(table[:, -1].mean()):.1f}" for name, table in regrets.items() if name not in look.hidden]
     caption = (
         "Reward that the reference would have received more, summed up to each decision; below zero a selector is ahead of it, falling it gains. "
         "Decisions in which some policy has no outcome add nothing."
     )
-    return Figure("regret", "Regret", caption, panels)
+    text = f"Curves of the regret summed over decisions. At the end: {listed(ends)}."
+    return Figure("regret", "Regret", caption, text, panels, look.hidden)
 
 
-def penalty_figure(streams: Mapping[str, Stream], weights: RewardWeights, style: Style) -> Figure:
+def penalty_figure(streams: Mapping[str, Stream], weights: RewardWeights, look: Look) -> Figure:
     """Success against the weighted sum of time and price (paper, figure 6)."""
     label, scale = score_label(weights)
-    marks: list[Mark] = []
+    dots: list[Dot] = []
     for name, stream in streams.items():
         score, penalty = over_seeds(stream.score), over_seeds(stream.penalty)
-        if score is None or penalty is None:
-            continue
-        marks.append(
-            Points(
-                name,
-                [penalty.value],
-                [scale * score.value],
-                style.colour[name],
-                x_interval=([penalty.low], [penalty.high]),
-                y_interval=([scale * score.low], [scale * score.high]),
-                size=11,
-                symbol="star" if name in ORACLES.values() else "circle",
-                shown=name in style.shown,
-            )
-        )
+        if score is not None and penalty is not None:
+            dots.append(Dot(name, penalty, Estimate(scale * score.value, scale * score.low, scale * score.high)))
     caption = (
-        "Means over all decisions with 95% intervals (the paper's figure 6). Up and to the left is better; reward is height minus way to the right."
+        "Means over all decisions with 95% intervals (the paper's figure 6). Up and to the left is better; reward is height minus way to the right. "
+        "Diamonds: fixed policies; crosses: oracles. Dots that coincide stand side by side."
     )
-    panel = Panel("", "alpha_time · time + alpha_price · cents (reward)", label, marks)
-    return Figure("success_against_penalty", f"{label.partition(' (')[0].capitalize()} against time and cost", caption, [panel])
+    axes = ("alpha_time · time + alpha_price · cents (reward)", label)
+    places = listed([f"{dot.name} {dot.y.value:.3g} at {dot.x.value:.3g}" for dot in dots])
+    text = f"A dot for each way of choosing: {label} against the penalty. {places}."
+    panel = scatter("", dots, look.only([dot.name for dot in dots]), axes)
+    return Figure("success_against_penalty", f"{label.partition(' (')[0].capitalize()} against time and cost", caption, text, [panel], look.hidden)
 
 
-def share_figure(streams: Mapping[str, Stream], policies: Sequence[str], style: Style) -> Figure | None:
+def share_figure(streams: Mapping[str, Stream], policies: Sequence[str], look: Look) -> Figure | None:
     """How often each selector chose each policy lately."""
-    chosen = {name: stream.chosen for name, stream in streams.items() if stream.chosen is not None}
-    if not chosen or len(policies) < 2:
+    shares = {name: own for name, own in _shares(streams, len(policies)).items() if len(policies) > 1}
+    if not shares:
         return None
-    panels = []
-    for column, policy in enumerate(policies if len(policies) > 2 else policies[-1:], 0 if len(policies) > 2 else 1):
-        marks: list[Mark] = []
-        for name, columns in chosen.items():
-            share = _moving(100.0 * (columns == column).mean(axis=0))
-            at = thinned(len(share))
-            marks.append(Line(name, at + 1, share[at], style.colour[name], shown=name in style.shown))
-        panels.append(Panel(policy, "decision", "chosen (%)", marks, y_range=(-2.0, 102.0)))
+    at = thinned(next(len(own[0]) for own in shares.values()))
     caption = "Share of the decisions, over all seeds and the latest tenth of the stream up to each decision, in which a policy was chosen."
-    return Figure("choices", "Who is chosen", caption, panels)
+    ends = [
+        f"{name} {policy} {share[-1]:.0f}%"
+        for name, own in shares.items()
+        if name not in look.hidden
+        for policy, share in zip(policies, own, strict=True)
+    ]
+    text = f"Curves of how often each policy was chosen, a panel for each. At the end: {listed(ends, 12)}."
+    panels = []
+    for column, policy in enumerate(policies):
+        lines = [Line(name, own[column][at]) for name, own in shares.items()]
+        panels.append(curves(policy, at + 1, lines, look.only(list(shares)), ("decision", "chosen (%)"), (-2.0, 102.0)))
+    return Figure("choices", "Who is chosen", caption, text, panels if len(policies) > 2 else panels[1:], look.hidden)
 
 
 def gap_figure(gaps: Mapping[str, tuple[Estimate | float | None, Estimate | float | None]], oracle: str) -> Figure | None:
@@ -159,27 +157,23 @@ def gap_figure(gaps: Mapping[str, tuple[Estimate | float | None, Estimate | floa
         gaps: of each selector, None where it has none.
         oracle: what 100% is.
     """
-    shown = {name: both for name, both in gaps.items() if any(value is not None for value in both)}
+    found: dict[str, dict[str, Estimate]] = {"whole stream": {}, "last quarter": {}}
+    for name, both in gaps.items():
+        for part, value in zip(found.values(), both, strict=True):
+            if value is not None:
+                part[name] = value if isinstance(value, Estimate) else certain(float(value))
+    shown = [name for name in gaps if any(name in part for part in found.values())]
     if not shown:
         return None
-    marks: list[Mark] = []
-    for place, (label, colour) in enumerate((("whole stream", "c0"), ("last quarter", "c3"))):
-        found = [(name, _with_ends(both[place])) for name, both in shown.items()]
-        found = [(name, estimate) for name, estimate in found if np.isfinite(estimate.value)]
-        if not found:
-            continue
-        values, low, high = ([100 * getattr(estimate, end) for _, estimate in found] for end in ("value", "low", "high"))
-        marks.append(Bars(label, [name for name, _ in found], values, colour, low, high))
+    shown.sort(key=lambda name: -max(part[name].value for part in found.values() if name in part))
+    scaled = {label: {name: Estimate(100 * own.value, 100 * own.low, 100 * own.high) for name, own in part.items()} for label, part in found.items()}
     caption = f"0% is the best single policy, 100% the {oracle}. With 95% intervals over seeds and over what the expected oracle may be off."
     caption += " A selector that sees more than an oracle by groups can pass it."
-    return Figure("gap_closed", "Share of the learnable gap closed", caption, [Panel("", "", "learnable gap closed (%)", marks)])
-
-
-def _with_ends(value: Estimate | float | None) -> Estimate:
-    """Of a number without interval the ends are NaN, which draws none."""
-    if isinstance(value, Estimate):
-        return value
-    return Estimate(np.nan if value is None else value, np.nan, np.nan)
+    ends = [f"{name} {scaled['last quarter'][name].value:.0f}%" for name in shown if name in scaled["last quarter"]]
+    text = f"Dots with intervals, a row for each selector. Share of the gap to the {oracle} closed in the last quarter: {listed(ends)}."
+    look = Look({"whole stream": "muted", "last quarter": "ink"}, shapes={"last quarter": "diamond"})
+    panel = rows("", shown, scaled, look, "learnable gap closed (%)")
+    return Figure("gap_closed", "Share of the learnable gap closed", caption, text, [panel])
 
 
 def over_seeds(values: Array) -> Estimate | None:
@@ -194,36 +188,25 @@ def over_seeds(values: Array) -> Estimate | None:
     return Estimate(float(means.mean()), float(means.mean() - half), float(means.mean() + half))
 
 
-def _lines(values: Mapping[str, Array], style: Style) -> list[Mark]:
-    marks: list[Mark] = []
+def _lines(values: Mapping[str, Array]) -> tuple[NDArray[np.int64], list[Line]]:
+    """Which decisions are drawn, and of each name the mean over seeds with its band. All tables are (S, T) of the same T."""
+    at = thinned(next(iter(values.values())).shape[1])
+    lines = []
     for name, table in values.items():
-        at = thinned(table.shape[1])
         part = table[:, at]
         mean = part.mean(axis=0)
         half = _NORMAL * part.std(axis=0, ddof=1) / np.sqrt(len(part)) if len(part) > 1 else None
-        low, high = (None, None) if half is None else (mean - half, mean + half)
-        wide = 2.6 if name in ("auto", "ppo") else 1.7
-        dash = name == ORACLES["hindsight"] or (name == ORACLES["predictable"] and style.colour[name] == "muted")
-        marks.append(Line(name, at + 1, mean, style.colour[name], low, high, dash, wide, shown=name in style.shown))
-    return marks
+        lines.append(Line(name, mean) if half is None else Line(name, mean, mean - half, mean + half))
+    return at, lines
 
 
-def _settled_range(marks: Sequence[Mark]) -> tuple[float, float] | None:
-    """Limits of the y axis that show what is drawn after the first few decisions, in which luck rules."""
-    low: list[float] = []
-    high: list[float] = []
-    for mark in marks:
-        if isinstance(mark, Line) and mark.shown:
-            settled = np.asarray(mark.x) >= min(30.0, 0.3 * float(np.max(np.asarray(mark.x))))
-            for values, ends in ((mark.y, (low, high)), (mark.low, (low,)), (mark.high, (high,))):
-                known = np.asarray(values, np.float64)[settled] if values is not None else np.zeros(0)
-                known = known[np.isfinite(known)]
-                for end in ends if known.size else ():
-                    end.append(float(known.min() if end is low else known.max()))
-    if not low or not high:
-        return None
-    margin = 0.06 * max(max(high) - min(low), 1e-6)
-    return min(low) - margin, max(high) + margin
+def _shares(streams: Mapping[str, Stream], policies: int) -> dict[str, list[Array]]:
+    """Of what chooses: for each policy the percent (T,) of the decisions, over all seeds and the latest tenth of them, in which it was chosen."""
+    return {
+        name: [_moving(100.0 * (stream.chosen == column).mean(axis=0)) for column in range(policies)]
+        for name, stream in streams.items()
+        if stream.chosen is not None
+    }
 
 
 def _moving(values: Array) -> Array:

@@ -87,10 +87,12 @@ class Expert:
     def grasp(self, thing: str) -> tuple[Array, bool]:
         """Close until both fingers hold the thing firmly."""
         world = self.world
-        if float(np.linalg.norm(world.grasp_point(thing) - world.grip_position)) > 0.05:
+        off = float(np.linalg.norm(world.grasp_point(thing) - world.grip_position))
+        if off > 0.05:
             return self._again(thing)
         held = all(world.touches(finger, thing) for finger in ("left", "right"))
-        return self.towards(world.grasp_point(thing), self._grasp_yaw(thing), CLOSED, self._lean(thing)), held and world.gripper_command > 0.5
+        gripper = OPEN if world.gripper_command < -0.9 and off > world.robot.centred else CLOSED
+        return self.towards(world.grasp_point(thing), self._grasp_yaw(thing), gripper, self._lean(thing)), held and world.gripper_command > 0.5
 
     def lift(self, thing: str) -> tuple[Array, bool]:
         """Straight up to travelling height."""

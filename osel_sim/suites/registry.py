@@ -7,7 +7,7 @@ suite's; its value, `module:attribute`, is called without arguments and returns 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from osel_sim.core.errors import MissingPackageError, UnknownNameError, UsageError
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.instance import SUITE_SEPARATOR
 from osel_sim.interface.suite import OURS, Suite, Task
@@ -33,12 +33,7 @@ def load_suite(name: str, folder: Path | None = None, robot: str | None = None) 
     """
     if name in RESERVED:
         raise UsageError(f"{name!r} is no name for a suite: it means something else in names of tasks")
-    try:
-        make = SUITES.load(name, f"the suite stands before the colon, as in SUITE:TASK; {LISTING}")
-    except UsageError as error:
-        if isinstance(error.__cause__, ModuleNotFoundError) and error.__cause__.name is not None:
-            raise MissingPackageError(f"suite {name!r}", error.__cause__.name.partition(".")[0]) from error
-        raise
+    make = SUITES.load(name, f"the suite stands before the colon, as in SUITE:TASK; {LISTING}")
     if name == OURS:
         ours: Suite = make(folder, robot)
         return ours

@@ -1,109 +1,176 @@
 (() => {
   "use strict";
   const data = JSON.parse(document.getElementById("data").textContent);
-  const dark = window.matchMedia("(prefers-color-scheme: dark)");
-  const touch = window.matchMedia("(pointer: coarse)").matches;
 
-  // ---- figures: colours are names (@c0, or @c0/0.2 with an opacity) until the theme is known
-  const palette = () => (dark.matches ? data.palette.dark : data.palette.light);
+  // ---- figures. Each is a Vega-Lite specification of panels in the colours of the light theme; here they become those of the page, by name.
+  const NARROW = 480;
+  const names = new Map(Object.entries(data.palette.light).map(([name, value]) => [value, `var(--${name})`]));
+  const holders = [...document.querySelectorAll("figure[data-figure]")];
 
-  function colour(text, colours) {
-    const found = /^@(\w+)(?:\/([\d.]+))?$/.exec(text);
-    if (!found) return text;
-    const hex = colours[found[1]];
-    if (found[2] === undefined) return hex;
-    const [red, green, blue] = [1, 3, 5].map((place) => parseInt(hex.slice(place, place + 2), 16));
-    return `rgba(${red},${green},${blue},${found[2]})`;
-  }
+  const COLOURS = /^(range|color|fill|stroke|background)$|Color$/;
+  const WORDS = new Set(["domain", "values", "datasets"]);  // a name may look like a colour
 
-  function themed(value, colours, inColour = false) {
-    if (typeof value === "string") return inColour ? colour(value, colours) : value;
-    if (Array.isArray(value)) return value.map((item) => themed(item, colours, inColour));
+  function themed(value, inColour = false) {
+    if (typeof value === "string") return inColour && names.has(value) ? names.get(value) : value;
+    if (Array.isArray(value)) return value.map((item) => themed(item, inColour));
     if (value === null || typeof value !== "object") return value;
-    return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, themed(item, colours, inColour || /color$|^colorscale$/.test(key))]));
+    return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, themed(item, !WORDS.has(key) && (inColour || COLOURS.test(key)))]));
   }
 
-  const config = { responsive: true, displayModeBar: false };
+  const layersOf = (panel) => [panel, ...(panel.layer || [])];
 
-  function draw(holder) {
-    const figure = data.figures[holder.dataset.figure];
-    const plots = [...holder.querySelectorAll(".plot")];
-    const hidden = holder.hiddenNames;
-    const work = plots.map((plot, number) => {
-      const panel = themed(figure.panels[number], palette());
-      panel.data.forEach((trace) => { trace.visible = !hidden.has(trace.name); });
-      // A finger on a figure scrolls the page; it does not drag the axes away.
-      panel.layout.dragmode = touch ? false : "zoom";
-      if (touch) { panel.layout.xaxis.fixedrange = true; panel.layout.yaxis.fixedrange = true; }
-      panel.layout.showlegend = false;
-      if (panel.narrow.length && plot.clientWidth < 480) panel.layout.yaxis.ticktext = panel.narrow;
-      return Plotly.react(plot, panel.data, panel.layout, config);
-    });
-    return Promise.all(work);
-  }
-
-  const GLYPHS = { circle: "●", diamond: "◆", star: "★", x: "✕" };
-
-  function swatch(trace) {
-    const markers = trace.mode === "markers" || trace.mode === "markers+text";
-    const made = document.createElement(markers ? "b" : "i");
-    const name = trace.type === "bar" || markers ? trace.marker.color : trace.line.color;
-    if (markers) {
-      made.textContent = GLYPHS[trace.marker.symbol];
-      made.style.color = `var(--${name.slice(1)})`;
-    } else {
-      made.className = trace.type === "bar" ? "bar" : trace.line.dash === "dash" ? "dash" : "";
-      made.style.backgroundColor = `var(--${name.slice(1)})`;
+  // The specification's legend is for images: here a row of buttons hides and shows.
+  function legendOf(panel) {
+    for (const { encoding, mark } of layersOf(panel)) {
+      const scale = encoding?.color?.legend && encoding.color.scale;
+      if (!scale?.domain) continue;
+      const of = (channel) => layersOf(panel).map((layer) => layer.encoding?.[channel]?.scale?.range).find(Boolean);
+      const dashes = of("strokeDash"), shapes = of("shape");
+      const kind = dashes ? "line" : shapes ? "point" : mark.type || mark;
+      return scale.domain.map((name, place) => ({ name, kind, colour: names.get(scale.range[place]), dashed: dashes?.[place][1] > 0, shape: shapes?.[place] }));
     }
+    return [];
+  }
+
+  const GLYPHS = { circle: "●", diamond: "◆", cross: "✚", "triangle-up": "▲" };
+
+  function swatch({ kind, colour, dashed, shape }) {
+    const made = document.createElement(shape && kind !== "line" ? "b" : "i");
+    if (shape && kind !== "line") made.textContent = GLYPHS[shape];
+    else made.className = kind === "line" ? (dashed ? "dash" : "") : "bar";
+    made.style.setProperty("--own", colour);
     return made;
   }
 
-  function legends(holder) {
-    const figure = data.figures[holder.dataset.figure];
-    const panels = figure.panels.map((panel) => {
-      const named = new Map();
-      panel.data.forEach((trace) => { if (trace.showlegend !== false && !named.has(trace.name)) named.set(trace.name, trace); });
-      return named;
-    });
-    const traces = panels.flatMap((named) => [...named.values()]);
-    holder.hiddenNames = new Set(traces.filter((trace) => trace.visible === "legendonly").map((trace) => trace.name));
-    // Panels that show parts of the same share one legend; others have each their own.
-    const most = panels.reduce((best, named) => (named.size > best.size ? named : best), new Map());
-    const shared = panels.every((named) => [...named].every(([name, trace]) => most.has(name) && swatch(trace).outerHTML === swatch(most.get(name)).outerHTML));
-    if (shared) return legend(holder, most, holder.querySelector(":scope > .legend"));
-    panels.forEach((named, number) => legend(holder, named, holder.querySelectorAll(".panel > .legend")[number]));
-  }
-
-  function legend(holder, named, place) {
-    if (named.size < 2) return;
-    for (const [name, trace] of named) {
+  function legend(holder, entries, place) {
+    for (const entry of entries) {
       const button = document.createElement("button");
       const text = document.createElement("span");
-      text.innerHTML = name;  // escaped when the page was written: plotly reads entities in names too
+      text.textContent = entry.name;
       button.type = "button";
-      button.append(swatch(trace), text);
-      const show = () => button.setAttribute("aria-pressed", String(!holder.hiddenNames.has(name)));
+      button.append(swatch(entry), text);
+      const show = () => button.setAttribute("aria-pressed", String(!holder.hiddenNames.has(entry.name)));
       button.addEventListener("click", () => {
-        if (!holder.hiddenNames.delete(name)) holder.hiddenNames.add(name);
+        if (!holder.hiddenNames.delete(entry.name)) holder.hiddenNames.add(entry.name);
         show();
-        draw(holder);
+        holder.views.forEach((view) => view.signal("hidden", [...holder.hiddenNames]).runAsync());
       });
       show();
       place.append(button);
     }
   }
 
-  async function drawAll(holders) {
-    for (const holder of holders) {
-      await draw(holder);
-      holder.dataset.drawn = "true";
-      await new Promise((done) => setTimeout(done, 0));
+  function legends(holder) {
+    const spec = data.figures[holder.dataset.figure];
+    holder.hiddenNames = new Set(spec.params.find((param) => param.name === "hidden").value);
+    holder.views = [];
+    const panels = spec.concat.map(legendOf);
+    const shared = panels.every((entries) => JSON.stringify(entries) === JSON.stringify(panels[0]));
+    if (shared) return legend(holder, panels[0], holder.querySelector(":scope > .legend"));
+    panels.forEach((entries, number) => legend(holder, entries, holder.querySelectorAll(".panel > .legend")[number]));
+  }
+
+  // A closed fold has no width in some browsers: it will be that of its panel's share of the page.
+  function widthOf(plot) {
+    if (plot.clientWidth) return plot.clientWidth;
+    const most = Number(plot.closest(".panels").style.getPropertyValue("--most"));
+    const room = document.querySelector("main").clientWidth - 40;
+    return Math.floor(room / Math.max(1, Math.min(most, Math.floor(room / 340)))) - 26;
+  }
+
+  // Names of columns stand slanted where they are wider than these; how far the last one then reaches beyond its column.
+  function slant({ axis, scale }, width) {
+    const column = (0.74 * width) / scale.domain.length;
+    const letters = (name) => Math.min(axis.labelLimit, 6.2 * name.length);
+    axis.labelAngle = Math.max(...scale.domain.map(letters)) < column ? 0 : -35;
+    return axis.labelAngle ? Math.max(0, 0.82 * letters(scale.domain[scale.domain.length - 1]) - column / 2) : 0;
+  }
+
+  // A title in lines of at most so many letters.
+  function broken(title, letters) {
+    const lines = [""];
+    for (const word of title.split(" ")) {
+      if (lines[lines.length - 1].length + word.length < letters) lines[lines.length - 1] += ` ${word}`;
+      else lines.push(word);
     }
+    return lines.map((line) => line.trim()).filter(Boolean);
+  }
+
+  function fitted(spec, panel, width) {
+    const { $schema, config, datasets, data: common } = spec;  // panels of the same data have it once, above them
+    const fit = structuredClone({ ...(common && { data: common }), ...panel, $schema, config, datasets });
+    fit.params = [{ name: "hidden", value: [] }];
+    fit.width = width;
+    delete fit.title;  // a heading above the panel, which breaks where it must
+    fit.autosize = { type: "fit-x", contains: "padding" };
+    for (const layer of layersOf(fit)) {
+      for (const [channel, own] of Object.entries(layer.encoding || {})) {
+        if (channel === "x" && own.type === "nominal") fit.padding = { left: 5, top: 5, bottom: 5, right: 5 + Math.round(slant(own, width)) };
+        if (own.field === "name" && ["color", "shape", "strokeDash"].includes(channel)) own.legend = null;
+        if (width >= NARROW) continue;
+        if (channel === "x" && own.title) own.title = broken(own.title, (0.7 * width) / 6.5);
+        if (own.legend) Object.assign(own.legend, { title: broken(own.legend.title, (0.7 * width) / 6), columns: 3 });
+        if (!own.axis) continue;
+        if (channel === "y" && own.type === "nominal") own.axis.labelLimit = Math.round(width / 3.4);
+        if (channel === "x" && own.type === "quantitative") own.axis.tickCount = 4;
+      }
+    }
+    return themed(fit);
+  }
+
+  async function draw(holder) {
+    const spec = data.figures[holder.dataset.figure];
+    const plots = [...holder.querySelectorAll(".plot")];
+    const widths = plots.map(widthOf);
+    if (holder.widths === widths.join()) return;
+    holder.widths = widths.join();
+    holder.views.forEach((view) => view.finalize());
+    holder.views = [];
+    for (const [number, plot] of plots.entries()) {
+      const fit = fitted(spec, spec.concat[number], widths[number]);
+      fit.params[0].value = [...holder.hiddenNames];
+      // Without code made from text (`ast`): the page's policy allows none.
+      const { view } = await vegaEmbed(plot, fit, { ast: true, renderer: "svg", actions: false, tooltip: { disableDefaultStyle: true } });
+      view.addEventListener("click", (_, item) => { if (item?.datum?.instance !== undefined) show(item.datum.instance); });
+      holder.views.push(view);
+    }
+    holder.dataset.drawn = "true";
+  }
+
+  async function drawAll() {
+    for (const holder of holders) await draw(holder);
+    performance.mark("drawn");
     document.documentElement.dataset.ready = "true";
   }
 
+  let show = () => {};  // opens an instance's episodes; there may be none
+
+  // ---- tables: one that is wider than its column becomes a card for each row
+  const fit = (wide) => {
+    wide.classList.remove("stacked");
+    wide.classList.toggle("stacked", wide.querySelector("table").scrollWidth > wide.clientWidth + 1);
+  };
+  const tables = [...document.querySelectorAll(".table-block .wide")];
+  tables.forEach((wide) => {
+    const headings = [...wide.querySelectorAll("th")].map((cell) => cell.textContent);
+    wide.querySelectorAll("td").forEach((cell, place) => {
+      cell.dataset.label = headings[place % headings.length];
+      const interval = cell.querySelector(".interval");
+      if (interval) cell.title = `95% interval ${interval.textContent}`;
+    });
+  });
+
+  // ---- printing unfolds everything; afterwards it is as it was
+  let folded = [];
+  window.addEventListener("beforeprint", () => {
+    folded = [...document.querySelectorAll("details.fold:not([open])")];
+    folded.forEach((fold) => { fold.open = true; });
+  });
+  window.addEventListener("afterprint", () => folded.forEach((fold) => { fold.open = false; }));
+
   // ---- episodes
-  const PHASES = [["upload", "c3"], ["inference", "c4"], ["download", "c5"], ["motion", "c0"]];
+  // Shades of ink: colours are the policies'.
+  const PHASES = [["upload", 0.95], ["inference", 0.65], ["download", 0.4], ["motion", 0.18]];
   const PAGE = 40;
 
   function element(tag, className, text) {
@@ -246,7 +313,7 @@
       parts.forEach((value, place) => {
         const part = element("i");
         part.style.width = `${total ? (100 * value) / total : 0}%`;
-        part.style.backgroundColor = `var(--${PHASES[place][1]})`;
+        part.style.opacity = PHASES[place][1];
         bar.append(part);
       });
       return bar;
@@ -257,7 +324,7 @@
       line.append(element("strong", "", episode.policyName), " ", chip(episode));
       const parts = [["reward", episode.reward, 3, ""], ["", episode.steps, 0, " steps"], ["", episode.seconds, book.digits.seconds, " s"], ["", episode.price, book.digits.price, " cents"]];
       const graded = GRADED.filter(([name]) => episode[name] !== null).map(([name, shown]) => `${name} ${shown(episode[name])}`);
-      line.append(" ", [...graded, ...parts.filter(([, value]) => value !== null).map(([name, value, digits, unit]) => `${name} ${fixed(value, digits)}${unit}`.trim())].join(" · "));
+      line.append(" ", [...graded, ...parts.filter(([, value]) => value !== null && value !== undefined).map(([name, value, digits, unit]) => `${name} ${fixed(value, digits)}${unit}`.trim())].join(" · "));
       return line;
     }
 
@@ -314,10 +381,10 @@
       if (episode.error) body.append(element("p", "", `Ended in error: ${episode.error}`));
       if (episode.fallback) body.append(element("p", "", `Fell back to the local policy: ${episode.fallback}`));
       const key = element("p", "caption key");
-      PHASES.forEach(([name, colourName]) => {
+      PHASES.forEach(([name, shade]) => {
         const part = element("span");
         const dot = element("i");
-        dot.style.backgroundColor = `var(--${colourName})`;
+        dot.style.opacity = shade;
         part.append(dot, name === "motion" ? "rest of motion" : name);
         key.append(part);
       });
@@ -334,6 +401,11 @@
       return video.url;
     }
 
+    // Of an instance what was chosen, or its first episode.
+    show = (number) => {
+      const own = all.filter((episode) => episode.about.number === number);
+      if (own.length) open(own.find((episode) => episode.chosen === 1) || own[0]);
+    };
     Object.values(controls).forEach((control) => control.addEventListener("input", filter));
     more.addEventListener("click", () => extend(PAGE));
     filter();
@@ -344,8 +416,21 @@
   detail.addEventListener("close", () => detail.querySelectorAll("video").forEach((video) => video.pause()));
 
   if (data.episodes) episodes(data.episodes);
-  const holders = [...document.querySelectorAll("figure[data-figure]")];
   holders.forEach(legends);
-  drawAll(holders);
-  dark.addEventListener("change", () => holders.forEach(draw));
+  const watch = new ResizeObserver((entries) => entries.forEach(({ target }) => {
+    if (target.clientWidth === target.fittedWidth) return;
+    target.fittedWidth = target.clientWidth;
+    fit(target);
+  }));
+  tables.forEach((wide) => watch.observe(wide));
+  let width = window.innerWidth;
+  let waiting;
+  window.addEventListener("resize", () => {
+    if (window.innerWidth === width) return;  // a phone's address bar comes and goes
+    width = window.innerWidth;
+    clearTimeout(waiting);
+    waiting = setTimeout(drawAll, 200);
+  });
+  // The first screen first. What follows is one task, so that it is done before anything else happens to the page, such as printing.
+  draw(holders[0]).then(() => setTimeout(drawAll, 0));
 })();

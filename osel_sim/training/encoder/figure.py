@@ -4,13 +4,18 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from osel_sim.context.encoder import encode_many, load_encoder
 from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
 from osel_sim.core.content import find
 from osel_sim.core.errors import OselError
+
+if TYPE_CHECKING:
+    import altair as alt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -32,10 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def draw_contexts(encoder_name: str, task_name: str, data: Path, out: Path, count: int) -> None:
     """Encode `count` test instances, lay them out with t-SNE, and write the picture with the neighbour agreement in each title."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    import altair as alt
     from sklearn.manifold import TSNE
 
     from osel_sim.formats.task_file import load_task_file
@@ -56,23 +58,30 @@ def draw_contexts(encoder_name: str, task_name: str, data: Path, out: Path, coun
         ("phrasing", "contexts by phrasing", contexts, points),
         ("phrasing", "text part by phrasing, mean of its object and container taken off", residues, residue_points),
     )
-    figure, axes = plt.subplots(2, 2, figsize=(14, 14))
-    for axis, (name, title, vectors, places) in zip(axes.flat, panels, strict=True):
-        for index, value in enumerate(np.unique(labels[name])):
-            chosen = labels[name] == value
-            marker = "x" if str(value).startswith("held_out") else "o"
-            axis.scatter(*places[chosen].T, s=14, marker=marker, color=plt.get_cmap("tab20")(index % 20), label=str(value).replace("_", " "))
-        axis.set_title(
-            f"{title}\n{neighbour_agreement(vectors, labels[name]):.0%} of the 10 nearest agree ({chance(labels[name]):.0%} by chance)", fontsize=10
-        )
-        axis.legend(fontsize=7, ncols=7, loc="upper center", bbox_to_anchor=(0.5, -0.01), frameon=False)
-        axis.set_xticks([])
-        axis.set_yticks([])
-    figure.suptitle(f"Contexts of {count} unseen {task.name} instances, encoder {encoder_name} (t-SNE)")
-    figure.tight_layout()
+    charts = []
+    for name, title, vectors, places in panels:
+        agree = f"{neighbour_agreement(vectors, labels[name]):.0%} of the 10 nearest agree ({chance(labels[name]):.0%} by chance)"
+        charts.append(_dots(places, labels[name]).properties(title=alt.Title(title, subtitle=agree), width=480, height=480))
+    title = f"Contexts of {count} unseen {task.name} instances, encoder {encoder_name} (t-SNE)"
+    figure = alt.concat(*charts, columns=2, title=title).resolve_scale(color="independent", shape="independent")
     out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=70)
-    plt.close(figure)
+    figure.save(str(out), format="png")
+
+
+def _dots(places: NDArray[np.float32], labels: NDArray[np.str_]) -> "alt.Chart":
+    """Places (N, 2), a colour for each label and crosses for wordings that were held out."""
+    import altair as alt
+
+    names = [str(label).replace("_", " ") for label in labels]
+    rows = [{"x": float(x), "y": float(y), "name": name} for (x, y), name in zip(places, names, strict=True)]
+    domain = sorted(set(names))
+    x, y = alt.X("x:Q", axis=None, scale=alt.Scale(zero=False)), alt.Y("y:Q", axis=None, scale=alt.Scale(zero=False))
+    legend = alt.Legend(title=None, orient="bottom", columns=6, symbolLimit=0)
+    shapes = ["cross" if name.startswith("held out") else "circle" for name in domain]
+    color = alt.Color("name:N", scale=alt.Scale(domain=domain, scheme="tableau20"), legend=legend)
+    shape = alt.Shape("name:N", scale=alt.Scale(domain=domain, range=shapes), legend=legend)
+    chart: alt.Chart = alt.Chart(alt.InlineData(values=rows)).mark_point(filled=True, size=24, opacity=0.9).encode(x=x, y=y, color=color, shape=shape)
+    return chart
 
 
 if __name__ == "__main__":
