@@ -32,7 +32,7 @@ def make_env(task: str, *, tasks: Path | str | None = None, **options: Any) -> "
     Args:
         task: name of a task file. Environments of other suites: `osel_sim.suites.registry.find_task(name).open()`.
         tasks: folder with task files of your own.
-        options: split, level, axes, cameras, image_size, render_mode, as `osel_sim.sim.env.TaskEnv` takes them.
+        options: split, level, axes, cameras, image_size, render_mode, robot, as `osel_sim.sim.env.TaskEnv` takes them.
 
     Raises:
         UnknownNameError: no such task; names the nearest.

@@ -1,4 +1,4 @@
-"""The tasks, policies and suites there are, for `python -m osel_sim.run --list`: reads TOML and imports no simulator."""
+"""The tasks, robots, policies and suites there are, for `python -m osel_sim.run --list`: reads TOML and imports no simulator."""
 
 import json
 from dataclasses import asdict
@@ -10,11 +10,13 @@ from osel_sim.core.errors import OselError
 from osel_sim.core.shown import all_shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import TaskSpec, load_task_file
+from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.sim.robots import ROBOTS
 from osel_sim.suites import SUITES
 
 
 def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str, list[dict[str, Any]]]:
-    """All tasks, policies and suites of others, by name, as plain data.
+    """All tasks, robots, policies and suites of others, by name, as plain data.
 
     Args:
         tasks: a folder of the user's own task files.
@@ -25,6 +27,7 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
     """
     return {
         "tasks": [_task(load_task_file(file)) for _, file in sorted(content.files("tasks", tasks).items())],
+        "robots": [{"name": name} for name in sorted(ROBOTS.locations())],
         "policies": [_policy(load_policy_file(file)) for _, file in sorted(content.files("policies", policies).items())],
         "suites": [_suite(name) for name in SUITES.others()],
     }
@@ -44,6 +47,7 @@ def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Pa
     for task in found["tasks"]:
         table.add_row(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
     console().print(table)
+    console().print(f"Robots, for --robot: {', '.join(robot['name'] for robot in found['robots'])}; {DEFAULT_ROBOT} unless a task file names another")
     for suite in found["suites"]:
         table = Table("task", "title", "tags", "steps", title=f"Tasks of {suite['name']}: {suite['title']}", title_justify="left")
         for task in suite["tasks"]:

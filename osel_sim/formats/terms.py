@@ -20,8 +20,6 @@ RECEPTACLES = ("container", "zone", "peg", "drawer")
 """Kinds that objects can be put into, onto or around."""
 HINGED = ("drawer", "door")
 """Kinds that open and close."""
-ARTICULATED = (*HINGED, "button")
-"""Kinds with a part that moves."""
 
 
 class Signatures(Mapping[str, Signature]):
