@@ -330,7 +330,8 @@ def test_another_robot_is_recorded_and_stays_that_of_the_recording(world, refere
     before = files(folder)
     assert resume(world, folder).returncode == 0 and files(folder) == before
     assert record_main(["--resume", "--out", str(folder), "--robot", "Panda"]) == 2
-    assert "--robot Panda: " in (text := capsys.readouterr().err) and "began with UR5e" in text
+    text = capsys.readouterr().err
+    assert "--robot: Panda: " in text and "began with UR5e" in text
 
 
 def test_summary_of_a_log(reference, capsys):
