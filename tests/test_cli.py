@@ -1,4 +1,5 @@
 import json
+import os
 import subprocess
 import sys
 import time
@@ -136,6 +137,15 @@ def test_the_console_script_lists_commands_and_corrects_names(capsys: pytest.Cap
     assert all(f"  {name} " in listed for name in COMMANDS)
     assert main(["rekord"]) == 2
     assert "unknown command 'rekord': did you mean 'record'?" in capsys.readouterr().err
+
+
+def test_completion_is_installed_for_the_shell_in_use(tmp_path: Path) -> None:
+    environment = {**os.environ, "HOME": str(tmp_path), "SHELL": "/bin/bash"}
+    command = [sys.executable, "-m", "osel_sim", "--install-completion"]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    script = next(file for file in tmp_path.rglob("osel-sim") if file.is_file())
+    assert str(script) in done.stdout and "--warm-start" in script.read_text()
 
 
 def raises(error: BaseException) -> Callable[[], int]:
