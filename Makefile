@@ -1,4 +1,4 @@
-# make run | test | slow | lint | bench | policies | wheel | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
+# make run | test | slow | lint | docs | bench | policies | wheel | schemas | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
@@ -15,7 +15,7 @@ EPISODES ?= 240
 INSTANCES ?= 50
 POLICIES := local_small remote_specialist remote_base remote_large
 
-.PHONY: run test slow lint bench policies wheel requirements environment clean
+.PHONY: run test slow lint docs bench policies wheel schemas requirements environment clean
 
 run: $(READY)
 	$(PYTHON) -m osel_sim.run --task pick_place --policies local_small remote_large --counterfactual --video 3 --out $(OUT) $(ARGS)
@@ -31,6 +31,11 @@ lint: $(READY)
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports
+
+# Every warning is an error: a link or an anchor that leads nowhere, a page that is not in the navigation.
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 .venv/bin/mkdocs build --quiet --strict
+	@echo "written to build/site; open build/site/index.html"
 
 bench: $(READY)
 	$(PYTHON) benchmarks/simulation.py $(ARGS)
@@ -50,6 +55,10 @@ policies: $(READY)
 
 wheel: $(READY)
 	$(PYTHON) -m build --no-isolation
+
+# What editors complete and check TOML files by; a test compares them with the models.
+schemas: $(READY)
+	$(PYTHON) -m osel_sim.cli.schemas
 
 # Compiles the pinned packages again. What is pinned stays as it is where it still fits; ARGS=--upgrade takes the newest.
 requirements: $(READY)

@@ -44,7 +44,8 @@ def main() -> None:
     env, camera = TaskEnv("pick_place"), Camera()
     instance = make_instance(env.task, options.seed)
     env.load(instance)
-    outcome = run_episode(env, instance, Driver(spec, LocalCaller(make_policy(spec), spec)), subscribers=[camera])
+    driver = Driver(spec, LocalCaller(make_policy(spec, env.specification), spec, env.specification))
+    outcome = run_episode(env, instance, driver, subscribers=[camera])
     chosen = [camera.images[index] for index in np.linspace(0, len(camera.images) - 1, FRAMES).round().astype(int)]
     for steps, image in chosen:
         cv2.putText(image, f"step {steps}", (8, SIZE - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (20, 20, 20), 1, cv2.LINE_AA)

@@ -35,8 +35,9 @@ from osel_sim.interface.policy import Actions, Observation
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.protocol import Greeting, example_observation
 from osel_sim.remote.server import PolicyServer
+from osel_sim.sim.specification import specification
 
-GREETING = Greeting("mine", cameras=("agentview", "wrist"), image_size=96)
+GREETING = Greeting("mine", cameras=("agentview", "wrist"), image_size=96, action_dim=7, state_dim=8)
 
 
 class MyPolicy:
@@ -68,7 +69,7 @@ async def serve(port: int, token: str, demonstrate: bool) -> None:
 
 
 def call(url: str, token: str) -> None:
-    with RemoteClient(url, token, timeout=10) as client:
+    with RemoteClient(url, specification(), token, timeout=10) as client:
         client.reset("pick up the can")
         answer = client.act({**example_observation(GREETING), "task": "pick up the can"})
     print(f"actions {answer.actions.shape}, {answer.bytes_up:,} bytes up, {answer.bytes_down:,} down, {1e3 * answer.measured_seconds:.1f} ms")

@@ -27,7 +27,7 @@ class DoctorConfig(ContentSettings):
     policy: Annotated[str | None, MAIN] = None
     """name or file of a policy: run one instance with it and report on it"""
     task: Annotated[str, MAIN] = "pick_place"
-    """task of that instance"""
+    """task of that instance; of other suites SUITE:TASK"""
     seed: Annotated[Index, MAIN] = 0
     """seed of that instance"""
     level: Annotated[Index, MAIN] = 0
@@ -56,12 +56,11 @@ def _execute(config: DoctorConfig) -> int:
 def _examine_policy(config: DoctorConfig, policy: str) -> int:
     from osel_sim.cli.policy_report import print_report
     from osel_sim.episodes.policy_check import check_policy, find_policy
-    from osel_sim.formats.library import select_tasks
-    from osel_sim.sim.robots import with_robot
+    from osel_sim.suites.registry import find_task
 
     spec, folder = find_policy(policy, config.policies_dir)
     out = config.out or Path("runs") / "doctor" / spec.name
-    task = with_robot(select_tasks([config.task], config.tasks), config.robot)[0]
+    task = find_task(config.task, config.tasks, config.robot)
     report = check_policy(spec, task, config.seed, config.level, out, folder)
     if config.json:
         print(json.dumps(asdict(report), indent=2))

@@ -26,7 +26,7 @@ EXAMPLES = """examples:
   python -m osel_sim.ingest --metric action-mse --dataset data/bridge data/fractal --policies local_small remote_large --out logs/oxe
 
 Writes rollouts.parquet and contexts.npz into --out, nothing if the table is wrong. The same command goes on with an interrupted encoding, and another
---encoder adds its contexts to the log. How a mapping file looks: the top of osel_sim/ingestion/mapping.py."""
+--encoder adds its contexts to the log. How a mapping file looks: the top of osel_sim/ingestion/columns.py."""
 
 
 def _execute(config: IngestConfig) -> int:
@@ -36,6 +36,8 @@ def _execute(config: IngestConfig) -> int:
 
     result = ingest(config)
     weights, preset = result.weights
+    for note in result.notes:
+        print(note)
     print(f"{result.folder}: {len(result.rows)} rows, contexts of {result.encoder}, {result.seconds:.0f} s")
     print_rollouts(console(), result.rows, weights)
     print(f"reward ({preset}): {weights.success} - {weights.alpha_time} {weights.time_unit} - {weights.alpha_price} cents")

@@ -15,7 +15,7 @@ EXAMPLES = """examples:
   python -m osel_sim.run --task all --level 0 2 --selector auto --encoder osel_suite --warm-start assets/logs/suite   # it has seen a log's outcomes
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first --resume
-  python -m osel_sim.run --config runs/first/run.json --seed 1             # another run with the same settings
+  python -m osel_sim.run --config runs/first/run.json --seed 1 --out runs/second   # another run with the same settings
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
 contexts.npz, selector.safetensors, summary.json, curve.png, videos/, and report.html, the page about it, with figures/ and tables/ beside it.

@@ -15,9 +15,11 @@ from osel_sim.interface.policy import Actions, Observation
 from osel_sim.remote.codec import pack
 from osel_sim.remote.protocol import Greeting, example_observation
 from osel_sim.remote.server import PolicyServer
+from osel_sim.sim.specification import specification
 
 TOKEN = "test-token-123"
-GREETING = Greeting("sinusoid", ("agentview", "wrist"), 32)
+ENVIRONMENT = specification()
+GREETING = Greeting("sinusoid", ("agentview", "wrist"), 32, ENVIRONMENT.action.dimension, ENVIRONMENT.state_size, ENVIRONMENT.action)
 
 
 class Sinusoid:
@@ -83,16 +85,16 @@ def install_plugin(folder: Path) -> None:
     (folder / "toy_policies.py").write_text(
         f"import sys, os, time\nsys.path.append({str(here)!r})\n"
         "from remote_helpers import Sinusoid\n"
-        "def load(spec):\n"
+        "def load(spec, environment):\n"
         "    return Sinusoid\n"
-        "def load_broken(spec):\n"
+        "def load_broken(spec, environment):\n"
         "    raise RuntimeError('the weights are on holiday')\n"
         "class Stuck(Sinusoid):\n"
         "    def act(self, observation):\n"
         "        if observation['task'] == 'wait':\n"
         "            time.sleep(1000)\n"
         "        return super().act(observation)\n"
-        "def load_stuck(spec):\n"
+        "def load_stuck(spec, environment):\n"
         "    return Stuck\n"
     )
     info = folder / "toy_policies-1.0.dist-info"

@@ -50,11 +50,11 @@ class Colours:
         return np.array([*picture, *letters], np.float32)
 
 
-def load_calm(spec):
+def load_calm(spec, environment):
     return lambda: Wander(0.2)
 
 
-def load_wild(spec):
+def load_wild(spec, environment):
     return lambda: Wander(1.0)
 '''
 

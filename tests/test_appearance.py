@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from osel_sim import gallery
+from osel_sim.reporting import contact_sheet
 from osel_sim.sim.appearance import FIELDS
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.expert import Expert
@@ -227,8 +228,11 @@ def test_the_contact_sheet(tmp_path, capsys):
     out = tmp_path / "docs" / "sheet.png"
     assert gallery.main(["--task", "pick_place", "--size", "96", "--seed", "3", "--out", str(out)]) == 0
     picture = cv2.imread(str(out))
-    assert picture.shape == (gallery.HEADER + 96 + gallery.BAND, gallery.MARGIN + 4 * 96, 3)
-    cells = [picture[gallery.HEADER : gallery.HEADER + 96, gallery.MARGIN + 96 * level : gallery.MARGIN + 96 * (level + 1)] for level in range(4)]
+    assert picture.shape == (contact_sheet.HEADER + 96 + contact_sheet.BAND, contact_sheet.MARGIN + 4 * 96, 3)
+    cells = [
+        picture[contact_sheet.HEADER : contact_sheet.HEADER + 96, contact_sheet.MARGIN + 96 * level : contact_sheet.MARGIN + 96 * (level + 1)]
+        for level in range(4)
+    ]
     assert all((one != other).any() for one, other in itertools.pairwise(cells))
     assert [file.name for file in out.parent.iterdir()] == ["sheet.png"]
     for flags, message in (["--out", str(tmp_path / "a.jpg")], ".png"), (["--task", "pick_plac", "--out", str(out)], "did you mean 'pick_place'"):

@@ -198,4 +198,5 @@ def test_a_list_names_tasks_and_policies() -> None:
         assert name in table
     listed = json.loads(data)
     assert "pick_place" in [task["name"] for task in listed["tasks"]]
+    assert {"Panda", "UR5e", "Kinova3"} <= {robot["name"] for robot in listed["robots"]}
     assert {"local_small": "local", "remote_large": "remote"}.items() <= {policy["name"]: policy["location"] for policy in listed["policies"]}.items()

@@ -23,14 +23,16 @@ from osel_sim.core import content
 from osel_sim.core.errors import CheckpointError, ContentError, PolicyError, RemoteError, UsageError
 from osel_sim.episodes.drivers import choose_policies
 from osel_sim.formats import library
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.policy.lerobot_policy import load
-from osel_sim.policy.mapping import actions_of, message_of, orientation, state_of
+from osel_sim.policy.mapping import actions_of, message_of, orientation, state_of, state_size
 from osel_sim.policy.registry import session_factory
 from osel_sim.remote.policy import open_remote
+from osel_sim.sim.specification import specification
 
 SIZE = 32
+ROBOT = specification()
 STATE = np.array([0.1, 0.2, 1.0, np.pi / 2, 0.0, 0.0, 0.04, -0.04], np.float32)
 
 
@@ -45,10 +47,10 @@ def observation(**changes: Any) -> dict[str, Any]:
 def test_a_state_is_put_together_from_its_parts() -> None:
     parts = ("position", "quaternion", "gripper")
     half = np.sqrt(0.5)
-    assert state_of(observation(), Mapping(state_parts=parts)) == pytest.approx([0.1, 0.2, 1.0, half, 0, 0, half, 1.0])
-    assert state_of(observation(), Mapping(state_parts=("euler",))) == pytest.approx([np.pi / 2, 0, 0])
-    assert np.array_equal(state_of(observation(), Mapping()), STATE)
-    assert Mapping(state_parts=parts).state_size == 8
+    assert state_of(observation(), Conventions(state_parts=parts), ROBOT) == pytest.approx([0.1, 0.2, 1.0, half, 0, 0, half, 1.0])
+    assert state_of(observation(), Conventions(state_parts=("euler",)), ROBOT) == pytest.approx([np.pi / 2, 0, 0])
+    assert np.array_equal(state_of(observation(), Conventions(), ROBOT), STATE)
+    assert state_size(Conventions(state_parts=parts), ROBOT) == 8
 
 
 def test_rotations_agree_with_another_implementation(recwarn: pytest.WarningsRecorder) -> None:
@@ -73,17 +75,17 @@ def test_every_gripper_convention_ends_in_ours(gripper: str, opened: float, clos
     chunk = np.zeros((2, 7))
     chunk[:, 6] = opened, closed
     chunk[:, 0] = 0.01
-    actions = actions_of(chunk, Mapping(gripper=gripper, scale=(20.0, 20.0, 20.0, 2.0, 2.0, 2.0)))
+    actions = actions_of(chunk, Conventions(gripper=gripper, scale=(20.0, 20.0, 20.0, 2.0, 2.0, 2.0)), ROBOT.action)
     assert actions[:, 6].tolist() == [-1, 1] and actions[:, 0] == pytest.approx(0.2)
 
 
 def test_columns_are_picked_and_a_wrong_width_is_explained() -> None:
     wide = np.arange(32.0)[None].repeat(3, axis=0)
-    assert actions_of(wide, Mapping(columns=(0, 1, 2, 3, 4, 5, 7)))[0].tolist() == [0, 1, 2, 3, 4, 5, 7]
+    assert actions_of(wide, Conventions(columns=(0, 1, 2, 3, 4, 5, 7)), ROBOT.action)[0].tolist() == [0, 1, 2, 3, 4, 5, 7]
     with pytest.raises(PolicyError, match=r"shape \(3, 32\), the robot takes \(T, 7\).*columns"):
-        actions_of(wide, Mapping())
+        actions_of(wide, Conventions(), ROBOT.action)
     with pytest.raises(PolicyError, match=r"columns = .* needs more"):
-        actions_of(np.zeros(6), Mapping(columns=(0, 1, 2, 3, 4, 5, 6)))
+        actions_of(np.zeros(6), Conventions(columns=(0, 1, 2, 3, 4, 5, 6)), ROBOT.action)
 
 
 # -- files -------------------------------------------------------------------------------------------------------------
@@ -92,7 +94,7 @@ def test_columns_are_picked_and_a_wrong_width_is_explained() -> None:
 @pytest.mark.parametrize("file", sorted((content.root() / "examples" / "policies").glob("*.toml")), ids=lambda file: file.stem)
 def test_the_example_files_are_right(file: Path) -> None:
     spec = load_policy_file(file)
-    message = message_of(observation(), spec.mapping, spec.cameras)
+    message = message_of(observation(), spec.mapping, spec.cameras, ROBOT)
     assert spec.mapping.prompt in message and all(spec.mapping.key(camera) in message for camera in spec.cameras)
 
 
@@ -100,9 +102,8 @@ def test_the_example_files_are_right(file: Path) -> None:
     ("mapping", "message"),
     [
         ('images = { agentvie = "image" }', "mapping.images.agentvie: unknown value 'agentvie', did you mean 'agentview'?"),
-        ('state_parts = ["position", "quaternon"]', "did you mean 'quaternion'?"),
         ('gripper = "open_is_one"', "mapping.gripper: unknown value 'open_is_one', did you mean 'open_one'?"),
-        ("columns = [0, 1]", "mapping.columns: must be 7 column numbers"),
+        ("columns = []", "mapping.columns: must be column numbers"),
         ('prompt = "observation.state"', "two inputs have the name 'observation.state'"),
         ('sate = "x"', "mapping.sate: is not a known key, did you mean 'state'?"),
     ],
@@ -157,7 +158,7 @@ def save_act(folder: Path, state: int = 8, action: int = 7, statistics: bool = T
 def spec_of(folder: Path, **mapping: Any) -> Any:
     given = {"images": {"agentview": "observation.images.image", "wrist": "observation.images.image2"}} | mapping
     local = library.load_policy("local_small")
-    return dataclasses.replace(local, cameras=("agentview", "wrist"), image_size=SIZE, checkpoint=str(folder), mapping=Mapping(**given))
+    return dataclasses.replace(local, cameras=("agentview", "wrist"), image_size=SIZE, checkpoint=str(folder), mapping=Conventions(**given))
 
 
 @pytest.fixture(scope="module")
@@ -166,7 +167,7 @@ def act(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def chunk_of(spec: Any, **changes: Any) -> np.ndarray:
-    policy = load(spec)()
+    policy = load(spec, ROBOT)()
     policy.reset("put the can in the basket")
     return np.asarray(policy.act(observation(**changes)))
 
@@ -201,22 +202,22 @@ def test_a_checkpoint_with_other_names_drives(act: Path) -> None:
 )
 def test_a_wrong_mapping_is_explained_at_load(act: Path, mapping: dict[str, Any], words: list[str]) -> None:
     with pytest.raises(CheckpointError) as failure:
-        load(spec_of(act, **mapping))
+        load(spec_of(act, **mapping), ROBOT)
     assert all(word in str(failure.value) for word in words), str(failure.value)
 
 
 def test_wrong_dimensions_and_missing_statistics_are_explained(tmp_path: Path) -> None:
     wide = save_act(tmp_path / "wide", state=14, action=14)
     with pytest.raises(CheckpointError, match=r"it wants observation.state of shape \(14,\).*it gives action of shape \(14,\).*columns"):
-        load(spec_of(wide))
+        load(spec_of(wide), ROBOT)
     bare = save_act(tmp_path / "bare", statistics=False)
     with pytest.raises(CheckpointError, match=r"normalised .*observation\.state.*action.*hold no statistics.*normalised = false"):
-        load(spec_of(bare))
+        load(spec_of(bare), ROBOT)
     assert chunk_of(spec_of(bare, normalised=False)).shape == (8, 7)
     for file in bare.glob("policy_preprocessor*"):
         file.unlink()
     with pytest.raises(CheckpointError, match=r"has no policy_preprocessor\.json.*migrate_policy_normalization"):
-        load(spec_of(bare))
+        load(spec_of(bare), ROBOT)
 
 
 def test_a_policy_with_a_memory_is_asked_every_step(tmp_path: Path) -> None:
@@ -240,7 +241,7 @@ def test_a_policy_with_a_memory_is_asked_every_step(tmp_path: Path) -> None:
         pipeline.save_pretrained(tmp_path)
     spec = dataclasses.replace(spec_of(tmp_path, images={"agentview": "observation.images.image"}, normalised=False), cameras=("agentview",))
     with pytest.raises(CheckpointError, match=r"the last 2 observations.*execute = 1"):
-        load(spec)
+        load(spec, ROBOT)
     one, other = (chunk_of(dataclasses.replace(spec, execute=1)) for _ in range(2))
     assert one.shape == (1, 7) and np.array_equal(one, other)
 
@@ -306,7 +307,7 @@ def test_an_openpi_server_gets_its_own_names_and_its_actions_are_read(openpi: st
     spec = load_policy_file(
         openpi_file(tmp_path, openpi, NAMES + "columns = [0, 1, 2, 3, 4, 5, 6]\ngripper = 'open_one'\nscale = [2, 2, 2, 1, 1, 1]\n")
     )
-    remote = open_remote(dataclasses.replace(spec, remote=dataclasses.replace(spec.remote, network="none")) if spec.remote else spec)
+    remote = open_remote(dataclasses.replace(spec, remote=dataclasses.replace(spec.remote, network="none")) if spec.remote else spec, ROBOT)
     try:
         remote.reset("put the can in the basket", (0,))
         call = remote.call(observation())
@@ -328,25 +329,25 @@ def test_an_openpi_server_gets_its_own_names_and_its_actions_are_read(openpi: st
 )
 def test_what_an_openpi_server_does_not_take_is_explained_at_load(openpi: str, mapping: str, words: list[str], tmp_path: Path) -> None:
     with pytest.raises(RemoteError) as failure:
-        open_remote(load_policy_file(openpi_file(tmp_path, openpi, mapping)))
+        open_remote(load_policy_file(openpi_file(tmp_path, openpi, mapping)), ROBOT)
     assert all(word in str(failure.value) for word in [*words, "pi0_libero.toml", "[mapping]"]), str(failure.value)
 
 
 def test_a_server_whose_chunks_are_too_short_is_refused(openpi: str, tmp_path: Path) -> None:
     spec = load_policy_file(openpi_file(tmp_path, openpi, NAMES + COLUMNS))
     with pytest.raises(RemoteError, match=r"chunks hold 10 actions, execute = 11"):
-        open_remote(dataclasses.replace(spec, execute=11))
+        open_remote(dataclasses.replace(spec, execute=11), ROBOT)
 
 
 # -- the expert, and the doctor ----------------------------------------------------------------------------------------
 
 
 def test_the_expert_is_only_used_where_it_is_named_and_never_served(tmp_path: Path) -> None:
-    assert "scripted_expert" not in [spec.name for spec in choose_policies(None)]
-    (spec,) = choose_policies(["scripted_expert"])
+    assert "scripted_expert" not in [spec.name for spec in choose_policies(None, ROBOT)]
+    (spec,) = choose_policies(["scripted_expert"], ROBOT)
     assert spec.is_privileged and not spec.is_remote
     with pytest.raises(UsageError, match="cannot be served"):
-        session_factory(spec)
+        session_factory(spec, ROBOT)
     text = spec.file.read_text()
     (tmp_path / "scripted_expert.toml").write_text(text.replace('"local"', '"remote"'))
     with pytest.raises(ContentError, match="location: must be 'local'"):

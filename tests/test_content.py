@@ -78,7 +78,7 @@ def test_a_list_shows_a_users_own_policies_and_refuses_broken_ones(tmp_path: Pat
     file = copy_of("local_small", tmp_path, "broken", execute="exekute")
     refused = subprocess.run(command, capture_output=True, text=True)
     assert refused.returncode == 2
-    assert refused.stderr == f"error: {file}: execute: is missing, expected an integer\n"
+    assert refused.stderr == f"error: {file}: exekute: is not a known key, did you mean 'execute'?\n"
 
 
 def test_errors_name_the_file(tmp_path: Path) -> None:

@@ -89,7 +89,18 @@ class Steps(Subscriber):
 
 def spec(name="p", mode=None, execute=8, price=PRICE):
     remote = None if mode is None else Remote(mode=mode)
-    return PolicySpec(name, name, "test", "", ("agentview",), 32, execute, 0.01, remote, price, Path("p.toml"))
+    return PolicySpec(
+        name=name,
+        title=name,
+        kind="test",
+        cameras=("agentview",),
+        image_size=32,
+        execute=execute,
+        inference_seconds=0.01,
+        remote=remote,
+        price=price,
+        file=Path("p.toml"),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -180,7 +191,7 @@ def test_a_chunk_shorter_than_execute_is_used_up(env, instance):
     [(0.0, True, 0), (0.3, True, 6), (0.301, True, 7), (0.02, True, 1), (0.02, False, 0), (0.05, False, 0), (0.12, False, 3)],
 )
 def test_delay_in_steps(seconds, remote, steps):
-    assert delay_steps(Call(np.zeros((1, 7), np.float32), inference=seconds), remote) == steps
+    assert delay_steps(Call(np.zeros((1, 7), np.float32), inference=seconds), remote, 20) == steps
 
 
 def test_a_failed_call_hands_over_to_the_fallback_for_the_rest(env, instance):

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from osel_sim.reporting.description import Column, Table
 
 from osel_sim.context.cache import ContextCache
 from osel_sim.core import arrays
@@ -21,6 +20,7 @@ from osel_sim.core.csv_text import to_csv
 from osel_sim.core.errors import DataError
 from osel_sim.formats.replay_result import _csv
 from osel_sim.reporting import html_tables
+from osel_sim.reporting.html_tables import Column, Table
 
 FORMULAS = [
     "=1+1",

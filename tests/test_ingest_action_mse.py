@@ -12,6 +12,7 @@ from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.ingest import main as ingest_main
 from osel_sim.ingestion.action_mse import Measurement, action_mse, measure_one, open_datasets
 from osel_sim.policy.local import LocalCaller
+from osel_sim.sim.specification import specification
 
 EPISODES = 2
 
@@ -68,7 +69,7 @@ def test_who_knows_the_answer_has_no_error_and_a_crash_is_no_score(dataset):
     logged[len(own) :] = 1.0  # beyond the episode nothing counts
 
     def ask(off):
-        driver = Driver(spec, LocalCaller(Replays(logged, off), spec))
+        driver = Driver(spec, LocalCaller(Replays(logged, off), spec, specification()))
         return measure_one(sample, driver, sample.dataset.observation(sample.frame), 0.05)
 
     right, wrong, crashed = ask(0.0), ask(0.3), ask(None)
@@ -112,6 +113,6 @@ def test_bad_datasets_get_one_line(dataset, tmp_path, capsys):
     assert ingest_main([*flags, "--camera", "wrist"]) == 2
     assert ingest_main([*flags, "--camera", "wrist=observation.images.wrist"]) == 2
     error = capsys.readouterr().err
-    assert "--camera must be CAMERA=COLUMN, got 'wrist'" in error
+    assert "--camera: must be CAMERA=COLUMN, got 'wrist'" in error
     assert "--camera wrist: no policy has that camera" in error
     assert not (tmp_path / "log").exists()

@@ -17,12 +17,15 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_LANGUAGE_TOKENS, 
 from osel_sim.core.errors import CheckpointError
 from osel_sim.core.torch_settings import threads
 from osel_sim.formats import library
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
 from osel_sim.policy.language_chunk import LanguageChunkConfig, LanguageChunkPolicy, make_language_chunk_pre_post_processors
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.processing import area_weights, rotation_columns
 from osel_sim.policy.text import PADDING, embed, tokenise
+from osel_sim.sim.specification import specification
 from osel_sim.training.recipe import find_recipe, load_recipe
+
+ROBOT = specification()
 
 SIZE = 32
 SMALL = {"image_size": 24, "stem_channels": 8, "channels": 16, "keypoints": 4, "query_dim": 8, "vocabulary": 256, "text_dim": 16, "hidden": 32}
@@ -67,7 +70,7 @@ def spec_of(folder: Path | str, **changes: Any) -> Any:
 
 
 def act(folder: Path, instruction: str = INSTRUCTION, **changes: Any) -> np.ndarray:
-    policy = load(spec_of(folder, **changes))()
+    policy = load(spec_of(folder, **changes), ROBOT)()
     policy.reset(instruction)
     return policy.act(observation(cameras=changes.get("cameras", ("agentview",))))
 
@@ -152,7 +155,7 @@ def test_instruction_changes_the_actions(checkpoint: Path) -> None:
 
 
 def test_sessions_share_weights_and_nothing_else(checkpoint: Path) -> None:
-    make_session = load(spec_of(checkpoint))
+    make_session = load(spec_of(checkpoint), ROBOT)
     first, second = make_session(), make_session()
     first.reset(INSTRUCTION)
     second.reset("put the milk in the tray")
@@ -196,7 +199,7 @@ def test_lerobots_own_act_loads_and_reads_the_instruction(tmp_path: Path) -> Non
         pipeline.save_pretrained(tmp_path)
     with pytest.raises(CheckpointError, match=r'environment_state says what it is \(known: "hashed_text"\)'):
         act(tmp_path)
-    reads = Mapping(environment_state="hashed_text")
+    reads = Conventions(environment_state="hashed_text")
     one, other = act(tmp_path, mapping=reads), act(tmp_path, "put the milk in the tray", mapping=reads)
     assert one.shape == (10, 7)
     assert not np.array_equal(one, other)
@@ -211,7 +214,7 @@ def test_lerobots_own_act_loads_and_reads_the_instruction(tmp_path: Path) -> Non
 )
 def test_misfit_says_what_is_wanted_and_what_is_given(checkpoint: Path, changes: dict[str, Any], words: tuple[str, ...]) -> None:
     with pytest.raises(CheckpointError) as failure:
-        load(spec_of(checkpoint, **changes))
+        load(spec_of(checkpoint, **changes), ROBOT)
     assert all(word in str(failure.value) for word in (*words, "local_small.toml"))
 
 
@@ -224,7 +227,7 @@ def test_wrong_state_and_action_dimensions_are_refused(tmp_path: Path) -> None:
     for pipeline in make_pre_post_processors(config):
         pipeline.save_pretrained(tmp_path)
     with pytest.raises(CheckpointError, match=r"shape \(14,\), the simulation gives \(8,\).*shape \(14,\), the robot takes \(7,\)"):
-        load(spec_of(tmp_path))
+        load(spec_of(tmp_path), ROBOT)
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "json", "weights", "type"])
@@ -241,7 +244,7 @@ def test_damaged_checkpoints_are_refused_in_one_line(tmp_path: Path, damage: str
     if damage == "type":
         (folder / "config.json").write_text('{"type": "telepathy"}')
     with pytest.raises(CheckpointError) as failure:
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     assert "\n" not in str(failure.value) and str(folder) in str(failure.value)
 
 
@@ -252,7 +255,7 @@ def test_a_hub_name_without_access_ends_soon_in_one_line(monkeypatch: pytest.Mon
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
     start = time.monotonic()
     with pytest.raises(CheckpointError) as failure:
-        load(spec_of("nobody/nothing"))
+        load(spec_of("nobody/nothing"), ROBOT)
     assert "\n" not in str(failure.value) and "nobody/nothing" in str(failure.value)
     assert time.monotonic() - start < 15  # the hub's client alone would retry for half a minute
 

@@ -16,13 +16,12 @@ from run_helpers import HORIZON, children, command, environment, execute, make_w
 
 from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
-from osel_sim.core import content
 from osel_sim.core.files import digest
 from osel_sim.episodes.workers import Plan
 from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
-from osel_sim.formats.task_file import load_task_file
 from osel_sim.record import main as record_main
+from osel_sim.suites.registry import find_task
 
 INSTANCES, REPEATS = 5, 2
 SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)
@@ -56,7 +55,7 @@ def resume(world: Path, folder: Path, *flags: object) -> subprocess.CompletedPro
 
 
 def test_repeats_are_of_all_levels():
-    task, policy = load_task_file(content.find("tasks", "lift")), library.load_policy("local_small")
+    task, policy = find_task("lift"), library.load_policy("local_small")
     plan = Plan((task,), (policy,), (policy,), range(40), (0, 2), "test", "osel_small", repeats=3, repeat_every=10)
     repeated = [plan.instances[key] for key in plan.instances if len(plan.episodes(key)) == 3]
     assert sorted(instance.level for instance in repeated) == [0, 0, 2, 2]
@@ -289,7 +288,7 @@ def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_r
     again = resume(world, world / "dying")
     assert again.returncode == 0 and "lost" not in again.stderr, again.stderr
     assert read_rollouts(world / "dying")[0] == [row for row in whole if row.repeat == 0]
-    assert "is complete" in resume(world, world / "dying").stdout
+    assert "is complete" in resume(world, world / "dying").stderr
 
 
 def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, reference):
@@ -300,7 +299,7 @@ def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, r
     write_rollouts(folder, rows, {key: value for key, value in metadata.items() if key != "schema_version"})
     before = files(folder)
     done = resume(world, folder)
-    assert done.returncode == 0 and "is complete" in done.stdout and files(folder) == before
+    assert done.returncode == 0 and "is complete" in done.stderr and files(folder) == before
 
 
 def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
@@ -318,6 +317,20 @@ def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
         for place, log in ((reference[0], clean), (folder, rows))
     )
     assert (before != after).any(axis=1).all()
+
+
+@pytest.mark.slow
+def test_another_robot_is_recorded_and_stays_that_of_the_recording(world, reference, capsys):
+    folder = world / "ur5e"
+    assert execute(world, "record", "--instances", 1, "--robot", "UR5e", "--workers", 1, "--out", folder).returncode == 0
+    rows, metadata = read_rollouts(folder)
+    assert {(row.instance, row.robot) for row in rows} == {("short/test/0/0-UR5e", "UR5e")}
+    assert (metadata["robot"], metadata["schema_version"]) == ("UR5e", 3)
+    assert read_rollouts(reference[0])[1]["schema_version"] == 2
+    before = files(folder)
+    assert resume(world, folder).returncode == 0 and files(folder) == before
+    assert record_main(["--resume", "--out", str(folder), "--robot", "Panda"]) == 2
+    assert "--robot Panda: " in (text := capsys.readouterr().err) and "began with UR5e" in text
 
 
 def test_summary_of_a_log(reference, capsys):
@@ -347,6 +360,7 @@ def test_a_complete_recording_is_only_shown_again(world, reference, capsys):
         (["--level", "17"], "unknown level 17"),
         (["--axis", "camra=2"], "did you mean 'camera'?"),
         (["--axis", "camera"], "must read AXIS=LEVEL"),
+        (["--robot", "UR5"], "did you mean 'UR5e'?"),
         (["--resume"], "there is no run in"),
     ],
 )

@@ -25,15 +25,16 @@ def numbers(tmp_path, monkeypatch):
         "seven = fine_numbers:SEVEN\npi = fine_numbers:SEVEN\nlost = fine_numbers:EIGHT\nboth = fine_numbers:SEVEN\n",
         "SEVEN = 7.0",
     )
+    install(tmp_path, "poor_numbers", "ten = poor_numbers:TEN\n", "import no_such_package.of_numbers")
     install(tmp_path, "broken_numbers", "nine = broken_numbers:NINE\nboth = broken_numbers:NINE\n", "raise ValueError('no numbers today')")
     monkeypatch.syspath_prepend(tmp_path)
     return Registry("number", GROUP, {"pi": "math:pi", "nested": "sys:float_info.max", "text": "string:digits"}, float)
 
 
 def test_listing_imports_nothing(numbers):
-    assert sorted(numbers) == ["both", "lost", "nested", "nine", "pi", "seven", "text"]
+    assert sorted(numbers) == ["both", "lost", "nested", "nine", "pi", "seven", "ten", "text"]
     assert numbers.locations()["nine"] == "broken_numbers:NINE"
-    assert "nine" in numbers and "ten" not in numbers
+    assert "nine" in numbers and "eleven" not in numbers
 
 
 def test_names_are_loaded_and_a_plugin_cannot_replace_a_built_in_one(numbers):
@@ -47,6 +48,10 @@ def test_names_are_loaded_and_a_plugin_cannot_replace_a_built_in_one(numbers):
     [
         ("nine", "number 'nine' of the package broken_numbers 1.0: cannot import broken_numbers:NINE (ValueError: no numbers today)"),
         ("lost", "number 'lost' of the package fine_numbers 1.0: cannot import fine_numbers:EIGHT (AttributeError: "),
+        (
+            "ten",
+            "number 'ten' of the package poor_numbers 1.0 needs the package 'no_such_package', which is not installed: pip install no_such_package",
+        ),
         ("text", "number 'text': string:digits must be a float, it is a str"),
         ("both", "number 'both' is offered by several packages: "),
     ],

@@ -9,7 +9,7 @@ import msgpack
 import numpy as np
 import pytest
 from openpi_client import msgpack_numpy
-from remote_helpers import GREETING, TOKEN, Sinusoid, observation, serving, serving_with
+from remote_helpers import ENVIRONMENT, GREETING, TOKEN, Sinusoid, observation, serving, serving_with
 
 from osel_sim.core.errors import RemoteError
 from osel_sim.remote.client import RemoteClient
@@ -57,20 +57,20 @@ def free_port():
 
 def test_nobody_there():
     with raises_soon("Connection refused"):
-        RemoteClient(f"ws://127.0.0.1:{free_port()}", timeout=2).connect()
+        RemoteClient(f"ws://127.0.0.1:{free_port()}", ENVIRONMENT, timeout=2).connect()
     with raises_soon("cannot connect"):
-        RemoteClient("ws://no-such-host.invalid:80", timeout=2).connect()
+        RemoteClient("ws://no-such-host.invalid:80", ENVIRONMENT, timeout=2).connect()
 
 
 @pytest.mark.parametrize("url", ["", "http://127.0.0.1:1", "ws://", "no url", "ws://127.0.0.1:99999"])
 def test_no_address(url):
     with raises_soon("is no WebSocket server|cannot connect"):
-        RemoteClient(url, timeout=2).connect()
+        RemoteClient(url, ENVIRONMENT, timeout=2).connect()
 
 
 def test_a_server_that_accepts_and_says_nothing():
     with tcp_server() as url, raises_soon(r"no connection within 0\.5 s"):
-        RemoteClient(url, timeout=0.5).connect()
+        RemoteClient(url, ENVIRONMENT, timeout=0.5).connect()
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_server_that_accepts_and_says_nothing():
 )
 def test_a_server_of_something_else(reply):
     with tcp_server(reply) as url, raises_soon("is no WebSocket server|answered HTTP|no connection"):
-        RemoteClient(url, timeout=1).connect()
+        RemoteClient(url, ENVIRONMENT, timeout=1).connect()
 
 
 @pytest.mark.parametrize(
@@ -88,15 +88,18 @@ def test_a_server_of_something_else(reply):
         (pack([1]), "the greeting must be a map, got list"),
         ("Traceback (most recent call last):\n  ...\nOSError: no GPU", "reported an error: OSError: no GPU"),
         (pack({**GREETING.to_dict(), "protocol": "osel_sim/99"}), "speaks 'osel_sim/99', this client 'osel_sim/1'"),
-        (pack({**GREETING.to_dict(), "action_dim": 14}), "must have 7 and 8 numbers"),
-        (pack({**GREETING.to_dict(), "cameras": "agentview"}), "lacks policy, cameras or image_size"),
+        (
+            pack({**GREETING.to_dict(), "action_dim": 14}),
+            r"its actions and states have 14 and 8 numbers, those of the .* osel_sim 7 and 8",
+        ),
+        (pack({**GREETING.to_dict(), "cameras": "agentview"}), "lacks policy, cameras, image_size, action_dim or state_dim"),
         (pack({**GREETING.to_dict(), "policy": "another"}), r"serves Greeting\(policy='another'.*expected Greeting\(policy='sinusoid'"),
         (pack({**GREETING.to_dict(), "image_size": 64}), "image_size=64"),
     ],
 )
 def test_a_greeting_we_cannot_work_with(greeting, reason):
     with serving_with(lambda connection: connection.recv(timeout=5), greeting) as url:
-        client = RemoteClient(url, timeout=2, expect=GREETING)
+        client = RemoteClient(url, ENVIRONMENT, timeout=2, expect=GREETING)
         with raises_soon(reason):
             client.connect()
         assert not client.connected
@@ -104,7 +107,7 @@ def test_a_greeting_we_cannot_work_with(greeting, reason):
 
 def test_no_greeting():
     with serving_with(lambda connection: None, b"") as url, raises_soon("greeting"):
-        RemoteClient(url, timeout=1).connect()
+        RemoteClient(url, ENVIRONMENT, timeout=1).connect()
 
 
 GOOD = np.zeros((8, 7), np.float32)
@@ -137,7 +140,7 @@ def test_a_lying_server(reply, reason):
         for message in connection:
             connection.send(message if RESET in str(unpack(message)) else reply)
 
-    with serving_with(answer) as url, RemoteClient(url, timeout=2) as client:
+    with serving_with(answer) as url, RemoteClient(url, ENVIRONMENT, timeout=2) as client:
         client.reset("x")
         with raises_soon(reason.replace("|O", r"\|O")):
             client.act(observation())
@@ -153,7 +156,7 @@ def test_actions_out_of_range_are_clipped():
         for _ in connection:
             connection.send(pack({"actions": np.linspace(-3, 3, 56).reshape(8, 7)}))
 
-    with serving_with(answer) as url, RemoteClient(url, timeout=2) as client:
+    with serving_with(answer) as url, RemoteClient(url, ENVIRONMENT, timeout=2) as client:
         actions = client.act(observation()).actions
         assert actions.dtype == np.float32 and actions.min() == -1.0 and actions.max() == 1.0
         assert np.abs(actions).min() < 0.1
@@ -164,7 +167,7 @@ def test_a_wrong_answer_to_a_reset():
         for _ in connection:
             connection.send(pack({"actions": GOOD}))
 
-    with serving_with(answer) as url, RemoteClient(url, timeout=2) as client, raises_soon("answered a reset with something else"):
+    with serving_with(answer) as url, RemoteClient(url, ENVIRONMENT, timeout=2) as client, raises_soon("answered a reset with something else"):
         client.reset("x")
 
 
@@ -174,7 +177,7 @@ def test_a_server_that_hangs():
     def hang(connection):
         release.wait(10)
 
-    with serving_with(hang) as url, RemoteClient(url, timeout=0.5) as client:
+    with serving_with(hang) as url, RemoteClient(url, ENVIRONMENT, timeout=0.5) as client:
         with raises_soon(r"no answer within 0\.5 s"):
             client.act(observation())
         release.set()
@@ -200,7 +203,7 @@ def test_a_server_that_stops_reading_cannot_block_the_sender():
         thread = threading.Thread(target=lambda: accepted.append(handshake()))
         thread.start()
         url = f"ws://127.0.0.1:{listener.getsockname()[1]}"
-        with RemoteClient(url, timeout=0.5) as client, raises_soon(r"took no message within 0\.5 s", 10.0):
+        with RemoteClient(url, ENVIRONMENT, timeout=0.5) as client, raises_soon(r"took no message within 0\.5 s", 10.0):
             client.act({**observation(), "observation.images.wrist": np.zeros(16 << 20, np.uint8)})
         thread.join(5)
         accepted[0].close()
@@ -213,7 +216,7 @@ def test_a_server_that_dies_in_the_middle():
         connection.recv(timeout=5)
         connection.socket.shutdown(socket.SHUT_RDWR)
 
-    with serving_with(answer_once) as url, RemoteClient(url, timeout=2) as client:
+    with serving_with(answer_once) as url, RemoteClient(url, ENVIRONMENT, timeout=2) as client:
         client.act(observation())
         with raises_soon("closed the connection"):
             client.act(observation())
@@ -225,7 +228,7 @@ def test_an_endless_answer():
         with contextlib.suppress(Exception):
             connection.send(b"\0" * (17 << 20))
 
-    with serving_with(flood) as url, RemoteClient(url, timeout=3) as client, raises_soon("closed the connection"):
+    with serving_with(flood) as url, RemoteClient(url, ENVIRONMENT, timeout=3) as client, raises_soon("closed the connection"):
         client.act(observation())
 
 
@@ -240,7 +243,7 @@ def test_a_plain_openpi_server_gets_no_reset():
                 msgpack_numpy.packb({"actions": np.ones((50, 7)), "state": np.zeros(8), "server_timing": timing, "policy_timing": timing})
             )
 
-    with serving_with(openpi, pack({"model": "pi0"})) as url, RemoteClient(url, timeout=2, expect=GREETING) as client:
+    with serving_with(openpi, pack({"model": "pi0"})) as url, RemoteClient(url, ENVIRONMENT, timeout=2, expect=GREETING) as client:
         client.reset("x")
         first, second = client.act(observation()), client.act(observation())
         assert first.actions.shape == (50, 7)
@@ -251,7 +254,7 @@ def test_a_plain_openpi_server_gets_no_reset():
 
 def test_reconnects_with_the_next_episode():
     with serving(Sinusoid) as url:
-        client = RemoteClient(url, TOKEN, timeout=2)
+        client = RemoteClient(url, ENVIRONMENT, TOKEN, timeout=2)
         for _ in range(3):
             client.reset("x")
             assert client.act(observation("x")).actions[0, 1] == np.float32(0.01)

@@ -10,6 +10,7 @@ from remote_helpers import observation, policy_spec
 
 from osel_sim.policy.registry import session_factory
 from osel_sim.remote.policy import open_remote
+from osel_sim.sim.specification import specification
 
 pytestmark = pytest.mark.slow  # each process imports LeRobot
 
@@ -62,8 +63,8 @@ def spec(tmp_path_factory):
 
 
 def test_the_wire_changes_no_bit(spec):
-    local = session_factory(spec)()
-    remote = open_remote(spec, timeout=30)
+    local = session_factory(spec, specification())()
+    remote = open_remote(spec, specification(), timeout=30)
     try:
         random = np.random.default_rng(0)
         for episode in range(2):

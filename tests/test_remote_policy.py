@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from remote_helpers import GREETING, TOKEN, Sinusoid, alive, install_plugin, observation, policy_spec, serving, serving_with
+from remote_helpers import ENVIRONMENT, GREETING, TOKEN, Sinusoid, alive, install_plugin, observation, policy_spec, serving, serving_with
 
 from osel_sim.core.errors import RemoteError, UsageError
 from osel_sim.interface.call import Call
@@ -37,7 +37,7 @@ def plugin(tmp_path, monkeypatch):
 
 def episode(url, spec, seed, network=None, calls=6):
     """Calls without what was measured, which alone may differ from run to run."""
-    remote = RemotePolicy(spec, RemoteClient(url, TOKEN, timeout=5), network)
+    remote = RemotePolicy(spec, RemoteClient(url, ENVIRONMENT, TOKEN, timeout=5), network)
     remote.reset("pick up the can", seed)
     results = [remote.call(observation(state=index / 10)) for index in range(calls)]
     remote.close()
@@ -71,7 +71,7 @@ def test_delays_are_the_same_again_and_differ_by_seed(url, tmp_path):
 
 def test_only_the_policys_own_cameras_travel(url, tmp_path):
     extra = {**observation(), "observation.images.front": np.zeros((640, 640, 3), np.uint8), "privileged": object()}
-    remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, TOKEN, timeout=5))
+    remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, TOKEN, timeout=5))
     remote.reset("x", (0,))
     assert remote.call(extra).failure is None
     remote.close()
@@ -120,7 +120,7 @@ def test_a_lying_server_fails_the_rest_of_the_episode_and_the_next_one_tries_aga
             connection.send(message if b"osel_sim/reset" in message else pack({"actions": np.full((4, 7), np.nan if nan else 0.5)}))
 
     with serving_with(answer) as url:
-        remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, timeout=2))
+        remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, timeout=2))
         remote.reset("x", (1,))
         for _ in range(2):
             call = remote.call(observation())
@@ -132,7 +132,7 @@ def test_a_lying_server_fails_the_rest_of_the_episode_and_the_next_one_tries_aga
 
 def test_a_server_that_is_gone_fails_calls_not_resets(tmp_path):
     with serving() as url:
-        remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, TOKEN, timeout=2))
+        remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, TOKEN, timeout=2))
         remote.reset("x", (1,))
         assert remote.call(observation("x")).failure is None
     call = remote.call(observation("x"))
@@ -144,11 +144,11 @@ def test_a_server_that_is_gone_fails_calls_not_resets(tmp_path):
 
 
 def test_a_call_before_any_reset_fails(tmp_path):
-    assert RemotePolicy(policy_spec(tmp_path), RemoteClient("ws://127.0.0.1:1")).call(observation()).failure == "no episode was started"
+    assert RemotePolicy(policy_spec(tmp_path), RemoteClient("ws://127.0.0.1:1", ENVIRONMENT)).call(observation()).failure == "no episode was started"
 
 
 def test_a_missing_observation_is_a_bug_to_be_seen(url, tmp_path):
-    remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, TOKEN, timeout=2))
+    remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, TOKEN, timeout=2))
     remote.reset("x", (1,))
     with pytest.raises(Exception, match=r"the observation lacks observation\.images\.wrist"):
         remote.call({key: value for key, value in observation().items() if "wrist" not in key})
@@ -156,7 +156,7 @@ def test_a_missing_observation_is_a_bug_to_be_seen(url, tmp_path):
 
 
 def test_a_local_policy_is_called_the_same_way(tmp_path):
-    caller = LocalCaller(Sinusoid(), policy_spec(tmp_path))
+    caller = LocalCaller(Sinusoid(), policy_spec(tmp_path), ENVIRONMENT)
     caller.reset("abc", (1, 2))
     call = caller.call(observation("abc"))
     assert call.actions[0, 0] == np.float32(0.03)
@@ -166,14 +166,14 @@ def test_a_local_policy_is_called_the_same_way(tmp_path):
         def act(self, observation):
             return np.full((8, 7), math.nan)
 
-    call = LocalCaller(Wrong(), policy_spec(tmp_path)).call(observation())
+    call = LocalCaller(Wrong(), policy_spec(tmp_path), ENVIRONMENT).call(observation())
     assert (call.actions, call.failure, call.seconds) == (None, "actions contain NaN or infinity", 0.1)
     with pytest.raises(ValueError, match="either actions or a failure"):
         Call(None)
 
 
 def test_own_server_process_answers_and_is_gone_afterwards(plugin):
-    remote = open_remote(policy_spec(plugin), timeout=10, start_timeout=60)
+    remote = open_remote(policy_spec(plugin), ENVIRONMENT, timeout=10, start_timeout=60)
     process = remote._server
     assert process.running
     assert TOKEN not in process.token and len(process.token) > 30
@@ -217,13 +217,13 @@ def test_own_server_process_answers_and_is_gone_afterwards(plugin):
 )
 def test_a_server_that_does_not_start_says_why(plugin, kind, reason):
     start = time.monotonic()
-    with pytest.raises(RemoteError, match=reason), PolicyServerProcess(policy_spec(plugin, kind=kind), start_timeout=60):
+    with pytest.raises(RemoteError, match=reason), PolicyServerProcess(policy_spec(plugin, kind=kind), ENVIRONMENT, start_timeout=60):
         pass
     assert time.monotonic() - start < 30
 
 
 def test_a_server_that_takes_too_long_to_start(plugin):
-    server = PolicyServerProcess(policy_spec(plugin), start_timeout=0.01)
+    server = PolicyServerProcess(policy_spec(plugin), ENVIRONMENT, start_timeout=0.01)
     with pytest.raises(RemoteError, match=r"not ready within 0\.01 s"):
         server.start()
     assert not server.running
@@ -233,8 +233,9 @@ def test_the_server_dies_with_its_parent_however_that_dies(plugin):
     policy_spec(plugin)
     script = (
         "import sys, time\nfrom pathlib import Path\nfrom osel_sim.formats.policy_file import load_policy_file\n"
-        "from osel_sim.remote.process import PolicyServerProcess\n"
-        "server = PolicyServerProcess(load_policy_file(Path(sys.argv[1])))\nserver.start()\nprint(server.pid, flush=True)\ntime.sleep(1000)\n"
+        "from osel_sim.remote.process import PolicyServerProcess\nfrom osel_sim.sim.specification import specification\n"
+        "server = PolicyServerProcess(load_policy_file(Path(sys.argv[1])), specification())\nserver.start()\n"
+        "print(server.pid, flush=True)\ntime.sleep(1000)\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", script, str(plugin / "sinusoid.toml")], stdout=subprocess.PIPE, text=True)
     pid = int(parent.stdout.readline())
@@ -252,15 +253,15 @@ def test_the_server_dies_with_its_parent_however_that_dies(plugin):
 
 def test_a_server_of_somebody_else(tmp_path, url, monkeypatch):
     monkeypatch.setenv("OSEL_SIM_TOKEN", TOKEN)
-    remote = open_remote(policy_spec(tmp_path, url=url), timeout=5)
+    remote = open_remote(policy_spec(tmp_path, url=url), ENVIRONMENT, timeout=5)
     remote.reset("x", (1,))
     assert remote.call(observation("x")).failure is None
     remote.close()
     with pytest.raises(RemoteError, match=r"serves Greeting.*expected Greeting"):
-        open_remote(policy_spec(tmp_path, name="other", url=url), timeout=5)
+        open_remote(policy_spec(tmp_path, name="other", url=url), ENVIRONMENT, timeout=5)
     monkeypatch.delenv("OSEL_SIM_TOKEN")
     with pytest.raises(RemoteError, match="refused the token"):
-        open_remote(policy_spec(tmp_path, url=url), timeout=5)
+        open_remote(policy_spec(tmp_path, url=url), ENVIRONMENT, timeout=5)
     assert GREETING.policy == "sinusoid"
 
 
@@ -273,4 +274,4 @@ def test_a_local_policy_file_cannot_be_opened_as_remote(tmp_path):
     from osel_sim.formats.policy_file import load_policy_file
 
     with pytest.raises(UsageError, match="is not a remote policy"):
-        open_remote(load_policy_file(file))
+        open_remote(load_policy_file(file), ENVIRONMENT)

@@ -7,7 +7,7 @@ import urllib.request
 import numpy as np
 import pytest
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
-from remote_helpers import GREETING, TOKEN, Sinusoid, observation, serving
+from remote_helpers import ENVIRONMENT, GREETING, TOKEN, Sinusoid, observation, serving
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -37,7 +37,7 @@ def ask(connection, message):
 
 
 def test_round_trip(url):
-    with RemoteClient(url, TOKEN, timeout=5, expect=GREETING) as client:
+    with RemoteClient(url, ENVIRONMENT, TOKEN, timeout=5, expect=GREETING) as client:
         client.reset("stack the cubes")
         expected = Sinusoid()
         expected.reset("stack the cubes")
@@ -74,7 +74,7 @@ def test_several_clients_each_have_their_own_state(url):
     results: dict[int, list[float]] = {}
 
     def drive(index: int) -> None:
-        with RemoteClient(url, TOKEN, timeout=10) as client:
+        with RemoteClient(url, ENVIRONMENT, TOKEN, timeout=10) as client:
             client.reset("x" * index)
             chunks = [client.act(observation("x" * index)).actions for _ in range(10)]
         results[index] = [round(float(chunk[0, 0]) * 100) * 1000 + round(float(chunk[0, 1]) * 100) for chunk in chunks]
@@ -104,7 +104,7 @@ def test_healthz_needs_no_token_and_nothing_else_goes_without(url):
 @pytest.mark.parametrize("token", [None, "wrong-token", TOKEN + "x", TOKEN[:-1], TOKEN.upper()])
 def test_a_wrong_token_is_refused(url, token):
     with pytest.raises(RemoteError, match="refused the token"):
-        RemoteClient(url, token, timeout=5).connect()
+        RemoteClient(url, ENVIRONMENT, token, timeout=5).connect()
 
 
 @pytest.mark.parametrize("header", [TOKEN, f"Bearer {TOKEN}", f"api-key {TOKEN}", f"Api-Key  {TOKEN}", "Api-Key"])
@@ -165,7 +165,7 @@ def test_a_float64_state_is_fine(raw):
 
 
 def test_an_oversize_message_closes_its_connection_and_no_other(url, raw):
-    with RemoteClient(url, TOKEN, timeout=5) as other:
+    with RemoteClient(url, ENVIRONMENT, TOKEN, timeout=5) as other:
         with pytest.raises(ConnectionClosed, match="1009"):
             raw.send(b"\0" * (3 << 20))
             raw.recv(timeout=5)
@@ -184,7 +184,7 @@ class Broken(Sinusoid):
 
 
 def test_a_failing_policy_tells_the_client_little_and_the_log_all(caplog):
-    with serving(Broken) as url, RemoteClient(url, TOKEN, timeout=5) as client:
+    with serving(Broken) as url, RemoteClient(url, ENVIRONMENT, TOKEN, timeout=5) as client:
         with pytest.raises(RemoteError, match="reported an error: InternalError: the policy failed; its server's log says why") as caught:
             client.act(observation("fail"))
         assert "secret" not in str(caught.value)
@@ -198,7 +198,7 @@ def test_a_failing_policy_tells_the_client_little_and_the_log_all(caplog):
 
 
 def test_health_and_other_clients_are_answered_during_an_inference():
-    with serving(Broken) as url, RemoteClient(url, TOKEN, timeout=10) as slow:
+    with serving(Broken) as url, RemoteClient(url, ENVIRONMENT, TOKEN, timeout=10) as slow:
         thread = threading.Thread(target=lambda: slow.act(observation("slow")))
         thread.start()
         time.sleep(0.2)
@@ -219,7 +219,7 @@ def test_an_inference_that_never_ends_does_not_keep_the_server(monkeypatch):
             return super().act(observation)
 
     with serving(Stuck) as url:
-        client = RemoteClient(url, TOKEN, timeout=0.3)
+        client = RemoteClient(url, ENVIRONMENT, TOKEN, timeout=0.3)
         client.connect()
         with pytest.raises(RemoteError, match=r"no answer within 0\.3 s"):
             client.act(observation())

@@ -5,7 +5,9 @@ import csv
 import io
 import json
 import re
+import shutil
 import sys
+from dataclasses import replace
 from urllib.parse import unquote
 
 import imageio_ffmpeg
@@ -20,6 +22,7 @@ from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.log import read_log
 from osel_sim.core.errors import UsageError
 from osel_sim.episodes.tensorboard import check_installed
+from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.report import main as report_main
 from osel_sim.reporting import episodes
 from osel_sim.reporting.areas import DARKEST, Cell, heatmap, regions, shares, stacked
@@ -28,7 +31,7 @@ from osel_sim.reporting.curves import Line, curves, thinned
 from osel_sim.reporting.dots import Dot, Path, apart, certain, clouds, rows, scatter
 from osel_sim.reporting.episodes import MOST_EPISODES, list_episodes
 from osel_sim.reporting.html_tables import Column, Table, to_csv, to_text
-from osel_sim.reporting.log_page import log_page
+from osel_sim.reporting.log_page import log_facts, log_page
 from osel_sim.reporting.log_sections import context_figure, policy_blocks, time_figure
 from osel_sim.reporting.page import write_page
 from osel_sim.reporting.palette import DARK, LIGHT, colours
@@ -104,6 +107,20 @@ def test_page_of_a_log(page_of_log):
     assert "There is something to route by" in page
     assert not list(folder.rglob("*.partial"))
     assert len(page) < 1_300_000
+
+
+def test_robots_are_told_apart_where_there_are_several(log, tmp_path):
+    rows, metadata = read_rollouts(log.source)
+    assert "robots" not in dict(log_facts(log, WEIGHTS)) and not any(log.labels("robot"))
+    shutil.copy(log.source / "contexts.npz", tmp_path)
+    write_rollouts(tmp_path, [replace(row, robot="UR5e") if row.seed % 3 == 1 else row for row in rows], metadata)
+    mixed = read_log(tmp_path)
+    blocks = {block.name: block for block in policy_blocks(mixed, WEIGHTS)}
+    assert "policies_by_robot" in blocks and "policies_by_robot" not in {block.name for block in policy_blocks(log, WEIGHTS)}
+    assert ("robots", "Panda, UR5e") in log_facts(mixed, WEIGHTS)
+    told = list_episodes(mixed, WEIGHTS).data["instances"]
+    assert [item["robot"] for item in told[:3]] == ["Panda", "UR5e", "Panda"]
+    assert all("robot" not in item for item in list_episodes(log, WEIGHTS).data["instances"])
 
 
 def test_words_from_a_log_stay_words(page_of_log):

@@ -75,8 +75,8 @@ def row(seed=0, policy="small", repeat=0, **more):
 def test_columns_types_and_schema_version(tmp_path):
     write_rollouts(tmp_path, [row()], {"task": "pick_place"})
     table = pyarrow.parquet.read_table(tmp_path / "rollouts.parquet")
-    assert table.schema.names == COLUMNS == schema().names
-    assert table.schema.metadata[b"osel_sim.schema_version"] == str(SCHEMA_VERSION).encode()
+    assert table.schema.names == COLUMNS == schema(2).names
+    assert table.schema.metadata[b"osel_sim.schema_version"] == b"2"
     assert table.schema.field("steps").type == pyarrow.int64()
     assert table.schema.field("success").type == pyarrow.bool_()
     assert table.schema.field("fallback").nullable
@@ -90,7 +90,7 @@ def test_what_goes_in_comes_out_and_equal_logs_are_equal_bytes(tmp_path):
     assert (tmp_path / "a" / "rollouts.parquet").read_bytes() == (tmp_path / "b" / "rollouts.parquet").read_bytes()
     read, metadata = read_rollouts(tmp_path / "a")
     assert read == rows
-    assert metadata == {"a": [2], "b": 1, "schema_version": SCHEMA_VERSION}
+    assert metadata == {"a": [2], "b": 1, "schema_version": 2}
     assert read[0].outcome.seconds.download == 0.3
 
 
@@ -101,7 +101,7 @@ def test_wrong_logs_are_refused(tmp_path):
     with pytest.raises(DataError, match="not a Parquet file"):
         read_rollouts(tmp_path)
     pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), tmp_path / "rollouts.parquet")
-    with pytest.raises(DataError, match="schema_version must be 1 to 2, got None"):
+    with pytest.raises(DataError, match="schema_version must be 1 to 3, got None"):
         read_rollouts(tmp_path)
 
 
@@ -115,12 +115,32 @@ def test_a_log_of_version_1_is_read_without_scores_and_axes(tmp_path):
     pyarrow.parquet.write_table(old.append_column("score", [[0.5, 0.25]]), file)
     with pytest.raises(DataError, match="columns must be"):
         read_rollouts(tmp_path)
-    pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"3"}), file)
-    with pytest.raises(DataError, match="schema_version must be 1 to 2, got 3"):
+    pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"4"}), file)
+    with pytest.raises(DataError, match="schema_version must be 1 to 3, got 4"):
         read_rollouts(tmp_path)
     pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"3 or so"}), file)
     with pytest.raises(DataError, match="metadata cannot be read"):
         read_rollouts(tmp_path)
+
+
+def test_a_log_of_several_robots_says_which(tmp_path):
+    rows = [row(), row(1), row(2, instance="pick_place/test/0/2-UR5e", robot="UR5e")]
+    write_rollouts(tmp_path, rows, {})
+    table = pyarrow.parquet.read_table(tmp_path / "rollouts.parquet")
+    assert table.schema.names == [*COLUMNS, "robot"] == schema().names
+    assert table.schema.metadata[b"osel_sim.schema_version"] == str(SCHEMA_VERSION).encode() == b"3"
+    assert table["robot"].to_pylist() == [None, None, "UR5e"]
+    assert read_rollouts(tmp_path)[0] == rows
+
+
+def test_the_tables_tell_robots_apart_where_there_are_several(capsys):
+    def said(rows):
+        print_rollouts(Console(width=160), rows, preset("mmlu"))
+        return [line.split("│")[1:4] for line in capsys.readouterr().out.splitlines() if line.startswith("│ robot")]
+
+    assert said([row(), row(1)]) == []
+    lines = said([row(), row(1), row(2, instance="pick_place/test/0/2-UR5e", robot="UR5e")])
+    assert [[cell.strip() for cell in line] for line in lines] == [["robot", "Panda", "2"], ["robot", "UR5e", "1"]]
 
 
 def changed(folder, **columns):

@@ -13,6 +13,7 @@ import pytest
 from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
 from synthetic_log import make_row, write_log
 
+from osel_sim.analysis.live import read_live
 from osel_sim.formats.journal import read_journal
 from osel_sim.run import main as run_main
 from osel_sim.selection.state import load_state
@@ -157,9 +158,28 @@ def test_ctrl_c_ends_with_what_there_is(world):
 
 def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):
     folder, _ = reference
-    for flags, key in ((["--seed", "1"], "seed"), (["--alpha-price", "1"], "reward.alpha_price"), (["--selector", "random"], "selector")):
+    for flags, key in (
+        (["--seed", "1"], "seed"),
+        (["--alpha-price", "1"], "reward.alpha_price"),
+        (["--selector", "random"], "selector"),
+        (["--robot", "UR5e"], "robot"),
+    ):
         assert user(world, "--episodes", EPISODES, "--counterfactual", "--out", folder, "--resume", *flags) == 2
         assert f"{key} was" in one_line(capsys)
+
+
+@pytest.mark.slow
+def test_another_robot_is_told_by_everything_a_run_writes(world, capsys):
+    folder = world / "ur5e"
+    assert execute(world, "run", "--episodes", 2, "--counterfactual", "--robot", "UR5e", "--out", folder).returncode == 0
+    assert json.loads((folder / "run.json").read_text())["configuration"]["robot"] == "UR5e"
+    assert [decision.robot for decision in read_journal(folder / "episodes.jsonl")] == ["UR5e", "UR5e"]
+    assert read_live(folder).outcomes.keys == ("short/test/0/0-UR5e", "short/test/0/1-UR5e")  # they have contexts
+    assert user(world, "--episodes", 2, "--counterfactual", "--out", folder, "--resume") == 2
+    assert "robot was 'UR5e' at the beginning, now it is None" in one_line(capsys)
+    before = bytes_of(folder)
+    assert execute(world, "run", "--episodes", 2, "--counterfactual", "--robot", "UR5e", "--out", folder, "--resume").returncode == 0
+    assert bytes_of(folder) == before
 
 
 def test_a_dead_server_is_replaced_by_the_local_policy_and_the_journal_says_so(world):
@@ -190,6 +210,7 @@ def test_a_dead_server_is_replaced_by_the_local_policy_and_the_journal_says_so(w
         (["--axis", "camra=2"], "did you mean 'camera'?"),
         (["--axis", "camera"], "must read AXIS=LEVEL"),
         (["--split", "tset"], "did you mean 'test'?"),
+        (["--robot", "UR5"], "unknown robot 'UR5': did you mean 'UR5e'?"),
         (["--tasks", "/nowhere"], "there is no folder /nowhere"),
         (["--resume"], "there is no run in"),
         (["--episods", "3"], "did you mean '--episodes'?"),

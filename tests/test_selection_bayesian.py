@@ -13,6 +13,7 @@ from osel_sim.selection.kernel_ucb import KernelUCBSelector
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.selection.state import load_state, save_state
+from osel_sim.sim.specification import specification
 
 POLICIES = ("a", "b", "c")
 CONTEXTUAL = ("linucb", "lints", "neural_linear", "auto")
@@ -222,7 +223,18 @@ def test_features_keep_what_matters():
 
 
 def spec(name: str, execute: int = 8, remote=None, **price):
-    return PolicySpec(name, name, "lerobot", "", ("agentview",), 96, execute, 0.02, remote, Price(**price), Path(f"{name}.toml"))
+    return PolicySpec(
+        name=name,
+        title=name,
+        kind="lerobot",
+        cameras=("agentview",),
+        image_size=96,
+        execute=execute,
+        inference_seconds=0.02,
+        remote=remote,
+        price=Price(**price),
+        file=Path(f"{name}.toml"),
+    )
 
 
 def test_costs_declared_by_policy_files():
@@ -234,12 +246,12 @@ def test_costs_declared_by_policy_files():
         spec("near", remote=Remote("ethernet")),
         spec("meanwhile", execute=40, remote=Remote("satellite", "async")),
     ]
-    costs = expected_costs(specs, weights, actions=80)
+    costs = expected_costs(specs, weights, actions=80, environment=specification())
     assert costs["local"] == pytest.approx(0.2 * np.log10(4.0))
     assert costs["paid"] - costs["local"] == pytest.approx(0.01 * (80 * 0.1 + 10 * 1.0))
     assert costs["far"] > costs["near"] > costs["local"]
     assert costs["meanwhile"] == pytest.approx(costs["local"], abs=0.01)
-    in_steps = expected_costs(specs, RewardWeights(0.05, 0.0, "steps"), actions=80)
+    in_steps = expected_costs(specs, RewardWeights(0.05, 0.0, "steps"), actions=80, environment=specification())
     assert in_steps["local"] == pytest.approx(4.0)
     with pytest.raises(UsageError, match="actions"):
-        expected_costs(specs, weights, actions=0)
+        expected_costs(specs, weights, actions=0, environment=specification())

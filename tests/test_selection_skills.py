@@ -13,7 +13,7 @@ from osel_sim.episodes.declared_skills import EXAMPLES, declare, declared_skills
 from osel_sim.formats import library
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.skills import UNKNOWN, Skills
-from osel_sim.sim.instance import make_instance
+from osel_sim.suites.registry import select_tasks
 
 DIM, KINDS = 16, 4
 CENTRES = np.eye(KINDS, DIM, dtype=np.float32)
@@ -126,7 +126,7 @@ def test_the_file_has_the_first_word_and_the_checkpoint_the_second(tmp_path: Pat
 def test_what_the_shipped_policies_declare_is_found_in_unseen_words():
     encoder = load_encoder("osel_suite")
     names = ("remote_specialist", "remote_base")
-    told = declare([library.load_policy(name) for name in names], encoder, library.select_tasks(["sort"]))
+    told = declare([library.load_policy(name) for name in names], encoder, select_tasks(["sort"]))
     assert told is not None and set(told.able) == set(names) and {len(contexts) for contexts in told.examples.values()} == {EXAMPLES}
     picture = np.full((96, 96, 3), 200, np.uint8)
     wide = {
@@ -139,10 +139,10 @@ def test_what_the_shipped_policies_declare_is_found_in_unseen_words():
     }
     for task, policy in wide.items():
         for seed in range(4):
-            instance = make_instance(library.select_tasks([task])[0], seed, 2, "test")
+            instance = select_tasks([task])[0].instance(seed, 2)
             shares = dict(zip(names, told.share(encoder.encode([picture], instance.instruction), names), strict=True))
             assert max(shares, key=shares.__getitem__) == policy, instance.instruction
     for seed in range(4):  # nobody declares it: it is not taken for the nearest that somebody does
-        instance = make_instance(library.select_tasks(["sort"])[0], seed, 2, "test")
+        instance = select_tasks(["sort"])[0].instance(seed, 2)
         assert told.share(encoder.encode([picture], instance.instruction), names).tolist() == [0.0, 0.0]
     assert declare([replace(library.load_policy("local_small"), checkpoint="")], encoder, ()) is None

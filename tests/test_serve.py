@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
-from remote_helpers import TOKEN, install_plugin, observation, policy_spec
+from remote_helpers import ENVIRONMENT, TOKEN, install_plugin, observation, policy_spec
 
 from osel_sim.core.errors import RemoteError
 from osel_sim.remote.client import RemoteClient
@@ -65,7 +65,7 @@ def test_serves_our_client_and_openpis_and_stops_when_told(folder, number, code)
         url = server.ready["url"]
         assert urllib.request.urlopen(url.replace("ws:", "http:") + "/healthz", timeout=5).status == 200
         assert WebsocketClientPolicy("127.0.0.1", server.ready["port"], TOKEN).infer(observation())["actions"].shape == (8, 7)
-        with RemoteClient(url, TOKEN, timeout=5) as client:
+        with RemoteClient(url, ENVIRONMENT, TOKEN, timeout=5) as client:
             client.reset("x")
             assert client.act(observation("x")).actions.shape == (8, 7)
             server.process.send_signal(number)
@@ -74,10 +74,10 @@ def test_serves_our_client_and_openpis_and_stops_when_told(folder, number, code)
 
 
 def test_makes_a_token_of_its_own_on_loopback(folder):
-    with Serving(folder, "sinusoid") as server, RemoteClient(server.ready["url"], server.ready["token"], timeout=5) as client:
+    with Serving(folder, "sinusoid") as server, RemoteClient(server.ready["url"], ENVIRONMENT, server.ready["token"], timeout=5) as client:
         client.reset("x")
         with pytest.raises(RemoteError):
-            RemoteClient(server.ready["url"], "another token", timeout=5).connect()
+            RemoteClient(server.ready["url"], ENVIRONMENT, "another token", timeout=5).connect()
 
 
 def test_stops_when_standard_input_ends(folder):
@@ -89,7 +89,7 @@ def test_stops_when_standard_input_ends(folder):
 
 def test_stops_in_time_even_when_the_policy_never_answers(folder):
     with Serving(folder, "stuck", OSEL_SIM_TOKEN=TOKEN) as server:
-        client = RemoteClient(server.ready["url"], TOKEN, timeout=0.5)
+        client = RemoteClient(server.ready["url"], ENVIRONMENT, TOKEN, timeout=0.5)
         client.connect()
         with pytest.raises(Exception, match="no answer"):
             client.act(observation("wait"))
@@ -105,7 +105,7 @@ def test_stops_in_time_even_when_the_policy_never_answers(folder):
         (["sinusiod"], r"unknown policy 'sinusiod': did you mean 'sinusoid'\?"),
         (["sinusoid", "--host", "0.0.0.0"], "put a token into the environment variable OSEL_SIM_TOKEN"),
         (["sinusoid", "--host", "0.0.0.0", "--token-env", "MY_TOKEN"], "put a token into the environment variable MY_TOKEN"),
-        (["sinusoid", "--port", "70000"], r"--port must lie in \[0, 65535\], got 70000"),
+        (["sinusoid", "--port", "70000"], r"--port: must lie in \[0, 65535\], got 70000"),
         (["sinusoid", "--host", "no-such-host.invalid", "--token-env", "GOOD_TOKEN"], "cannot listen on no-such-host.invalid"),
         (["sinusoid", "--token-env", "SHORT_TOKEN"], "a token must be 8 to 256 printable ASCII characters"),
         (["wrong"], r"wrong\.toml: execute: must lie in"),

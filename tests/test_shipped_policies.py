@@ -25,7 +25,7 @@ INSTANCES = 12
 def test_solves_unseen_instances(name, task, at_least):
     env = TaskEnv(task)
     spec = dataclasses.replace(library.load_policy(name), remote=None)
-    driver = Driver(spec, LocalCaller(make_policy(spec), spec))
+    driver = Driver(spec, LocalCaller(make_policy(spec, env.specification), spec, env.specification))
     outcomes = []
     for seed in range(INSTANCES):
         instance = make_instance(env.task, seed)

@@ -22,6 +22,7 @@ from osel_sim.interface.outcome import Outcome, Seconds
 from osel_sim.remote.client import RemoteClient
 from osel_sim.reporting.page import Page, Section, Verdict, to_html
 from osel_sim.run import main as run_main
+from osel_sim.sim.specification import specification
 
 HOSTILE = "a\x1b[2J\x1b]0;title\x07b\x9b31mc\x08\x7fd\rfake\u202eEVIL\u2066\u2028\x00\U000e0041"
 RAW = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\u2028\u2029\U000e0000-\U000e007f]")
@@ -79,7 +80,7 @@ def test_every_error_of_ours_is_safe_to_print(error: OselError) -> None:
 @pytest.mark.parametrize("token", [f"{SECRET}\n", f"{SECRET}\r", f"\x1b[31m{SECRET}", f"{SECRET} ", f"{SECRET}é", f"{SECRET}\x00", f" {SECRET}"])
 def test_a_token_that_cannot_be_sent_is_described_and_not_told(token: str) -> None:
     with pytest.raises(UsageError) as error:
-        RemoteClient("ws://127.0.0.1:9", token)
+        RemoteClient("ws://127.0.0.1:9", specification(), token)
     assert re.search(rf"OSEL_SIM_TOKEN cannot be sent: character \d+ of {len(token)} is", str(error.value))
     assert SECRET not in str(error.value) and not RAW.search(str(error.value))
 
@@ -87,7 +88,7 @@ def test_a_token_that_cannot_be_sent_is_described_and_not_told(token: str) -> No
 @pytest.mark.parametrize("address", [*ADDRESSES, f"ws://user:{SECRET}@", f"ws://user:{SECRET}@[x", f"ws://h:{SECRET}@x:y/"])
 def test_no_error_of_a_connection_tells_its_secrets(address: str) -> None:
     with pytest.raises(RemoteError) as error:
-        RemoteClient(address, timeout=2.0).connect()
+        RemoteClient(address, specification(), timeout=2.0).connect()
     assert SECRET not in str(error.value)
 
 
@@ -195,7 +196,7 @@ def test_plain_data_is_shown_whole() -> None:
 
 
 def test_a_server_logs_what_clients_send_safely() -> None:
-    code = "from osel_sim.serve import main, _Formatter; import logging; h = logging.StreamHandler(); h.setFormatter(_Formatter('%(message)s'));"
+    code = "from osel_sim.remote.serving import ShownFormatter as F; import logging; h = logging.StreamHandler(); h.setFormatter(F('%(message)s'));"
     code += "log = logging.getLogger('x'); log.addHandler(h); log.warning('refused: %s', 'a\\x1b[2J\\x9b')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stderr == "refused: a\\x1b[2J\\x9b\n"

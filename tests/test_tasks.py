@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from osel_sim.core import content
-from osel_sim.formats.task_file import ATTRIBUTE, load_task_file
+from osel_sim.formats.task_file import load_task_file
+from osel_sim.formats.terms import ATTRIBUTE
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.expert import Expert
 from osel_sim.sim.instance import make_instance

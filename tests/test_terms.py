@@ -6,12 +6,12 @@ import sys
 import numpy as np
 import pytest
 
-from osel_sim import record
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError, UsageError
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.formats.task_file import load_task_file
 from osel_sim.formats.terms import PREDICATES, SKILLS
+from osel_sim.record import main as record_main
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.expert import Expert
 from osel_sim.sim.instance import make_instance
@@ -76,7 +76,7 @@ def test_another_packages_predicate_and_skill(installed):
 @pytest.mark.slow
 def test_a_task_that_needs_them_is_recorded_in_workers(installed, tmp_path):
     flags = ["--task", "hover", "--tasks", str(installed), "--policies", "scripted_expert", "--instances", "2", "--workers", "1"]
-    assert record.main([*flags, "--out", str(tmp_path / "log")]) == 0
+    assert record_main([*flags, "--out", str(tmp_path / "log")]) == 0
     assert [row.success for row in read_rollouts(tmp_path / "log")[0]] == [True, True]
 
 

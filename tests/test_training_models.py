@@ -16,14 +16,17 @@ from osel_sim.core.errors import CheckpointError, ContentError, DataError, Unkno
 from osel_sim.formats import library
 from osel_sim.policy import register
 from osel_sim.policy.lerobot_policy import load
+from osel_sim.sim.specification import specification
 from osel_sim.training.annotations import load_annotations
 from osel_sim.training.batches import Batches, frames_of, statistics_of
 from osel_sim.training.dataset import load_demonstrations
 from osel_sim.training.instructions import Instructions
 from osel_sim.training.policy_training import Options, train
-from osel_sim.training.projection import places_in_view
+from osel_sim.training.projection import Pinhole
 from osel_sim.training.recipe import Augmentation, Recipe, find_recipe, load_recipe
 from osel_sim.training.source import Wanted
+
+ROBOT = specification()
 
 SIZES: dict[str, dict[str, int]] = {
     "octo_chunk": {"chunk_size": 8, "image_size": 48, "stem_channels": 8, "channels": 24, "trunk_layers": 1, "query_dim": 24, "vocabulary": 1024}
@@ -84,7 +87,7 @@ def test_a_checkpoint_drives_after_a_few_steps_and_resumes_to_the_same_weights(k
     observation = {"observation.images.agentview": world.render(positions, present, gripper), "observation.state": world.state_of(gripper, 0.0)}
     answers = []
     for text in ("put the can in the basket", "put the can in the basket", "put the lemon in the tray"):
-        policy = load(spec)()
+        policy = load(spec, ROBOT)()
         policy.reset(text)
         answers.append(policy.act({**observation, "task": text}))
     assert answers[0].shape == (8, 7) and np.array_equal(answers[0], answers[1])
@@ -129,7 +132,7 @@ def test_act_moves_to_what_its_perception_found(tmp_path: Path) -> None:
     result = run("act", tmp_path / "out", [data], 1200, evaluate_every=1200, changes={"optimisation": settings})
     final = result["validation"][-1]
     assert final["object_cm"] < 5 and final["container_cm"] < 5 and final["action_error"] < 0.2
-    policy = load(replace(library.load_policy("local_small"), checkpoint=str(tmp_path / "out"), image_size=48))()
+    policy = load(replace(library.load_policy("local_small"), checkpoint=str(tmp_path / "out"), image_size=48), ROBOT)()
     random, approached = np.random.default_rng(9), 0
     for _ in range(40):
         positions, present, target = world.scene(random)
@@ -146,7 +149,7 @@ def test_what_acts_perception_looks_at_must_be_given(tmp_path: Path, demonstrati
     run("act", tmp_path / "out", [demonstrations], 1)
     spec = replace(library.load_policy("local_small"), checkpoint=str(tmp_path / "out"), cameras=("wrist",))
     with pytest.raises(CheckpointError, match=r"it wants observation\.images\.agentview, the policy file gives observation\.images\.wrist"):
-        load(spec)
+        load(spec, ROBOT)
 
 
 def test_sizes_that_do_not_fit_are_one_line(tmp_path: Path, demonstrations: Path) -> None:
@@ -229,12 +232,12 @@ def test_roles_that_nothing_fills_and_properties_have_no_place(tmp_path: Path) -
         load_annotations(folder, columns)
 
 
-def test_places_of_a_frame_are_those_of_the_camera_as_it_is_then(demonstrations: Path) -> None:
+def test_places_of_points_in_a_camera(demonstrations: Path) -> None:
     """The flat world's camera sees columns grow with x and rows with y."""
     pose = json.loads((demonstrations / "meta" / "osel_sim.json").read_text())["cameras"]["agentview"]
     points = np.array([[0.2, -0.1, 0.8], [9.0, 0.0, 0.8]], np.float32)
-    found = places_in_view(pose, points, world.state_of(np.zeros(3), 0.0))
-    assert found[:2] == pytest.approx([0.5, -0.25]) and found[2:].tolist() == [2.0, 2.0]
+    seen, hidden = Pinhole.from_dict(pose).places(points[None], world.state_of(np.zeros(3), 0.0)[None])[0]
+    assert seen == pytest.approx([0.5, -0.25]) and np.isnan(hidden).all()
 
 
 def test_recipes_of_all_types_and_what_they_refuse(tmp_path: Path) -> None:

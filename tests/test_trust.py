@@ -22,7 +22,10 @@ from osel_sim.formats import library
 from osel_sim.policy import register
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.trust import check_checkpoint
+from osel_sim.sim.specification import specification
 from osel_sim.training.initial import Initial
+
+ROBOT = specification()
 
 SHIPPED = content.root() / "assets" / "policies" / "local_small"
 BEFORE, AFTER = "policy_preprocessor.json", "policy_postprocessor.json"
@@ -60,7 +63,7 @@ def spec_of(checkpoint: Path | str) -> Any:
 def test_a_class_of_another_module_is_never_called(folder: Path, tmp_path: Path, file: str) -> None:
     marker = tmp_path / "ran"
     insert(folder, popen(marker), file)
-    for build in (lambda: load(spec_of(folder)), lambda: Initial(folder)):
+    for build in (lambda: load(spec_of(folder), ROBOT), lambda: Initial(folder)):
         with pytest.raises(ForeignCodeError, match=rf"{file}: step 0 names 'subprocess\.Popen'.*--trust subprocess"):
             build()
     assert not marker.exists()
@@ -125,7 +128,7 @@ def test_whatever_a_step_names_is_looked_at_first(folder: Path, step: Any, words
         check_checkpoint(folder)
     assert f"{folder / BEFORE}: step 0 " in str(error.value) and words in str(error.value)
     with pytest.raises(CheckpointError, match="step 0"):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "{", "[]", '{"steps": {}}', "\x00", '{"steps": 1e999999}'])
@@ -149,7 +152,7 @@ def test_a_configuration_takes_no_key_that_no_field_has(folder: Path) -> None:
     (folder / "config.json").write_text(json.dumps({**data, "auto_map": {"AutoConfig": "evil.Config"}}))
     (folder / "evil.py").write_text("raise SystemExit('ran')")
     with pytest.raises(CheckpointError, match="auto_map"):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
 
 
 def test_weights_are_safetensors_and_nothing_else(folder: Path, tmp_path: Path) -> None:
@@ -161,10 +164,10 @@ def test_weights_are_safetensors_and_nothing_else(folder: Path, tmp_path: Path) 
 
     torch.save({"weights": Bomb()}, folder / "model.safetensors")
     with pytest.raises(CheckpointError, match="SafetensorError"):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     (folder / "model.safetensors").rename(folder / "pytorch_model.bin")
     with pytest.raises(CheckpointError):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     assert not (tmp_path / "ran").exists()
 
 
@@ -191,10 +194,10 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 def test_an_allowed_module_is_imported_and_its_steps_are_built(folder: Path, tmp_path: Path, module: str) -> None:
     insert(folder, {"class": f"{module}.Step", "config": {"marker": str(tmp_path / "ran")}})
     with pytest.raises(ForeignCodeError, match=f"--trust {module}"):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     assert module not in sys.modules
     trust([module])
-    load(spec_of(folder))
+    load(spec_of(folder), ROBOT)
     assert (tmp_path / "ran").exists()
 
 
@@ -202,10 +205,10 @@ def test_an_allowed_module_is_still_no_way_to_what_it_imports(folder: Path, tmp_
     trust([module])
     insert(folder, {**popen(tmp_path / "ran"), "class": f"{module}.Popen"})
     with pytest.raises(ForeignCodeError, match="is no ProcessorStep"):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     trust(["subprocess"])  # even then it is none
     with pytest.raises(ForeignCodeError, match="is no ProcessorStep"):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     assert not (tmp_path / "ran").exists()
 
 
@@ -216,7 +219,7 @@ def test_an_allowed_module_never_comes_from_the_checkpoint(folder: Path, monkeyp
     monkeypatch.syspath_prepend(str(folder))  # as when a command is started within it
     monkeypatch.delitem(sys.modules, "somebodys_steps", raising=False)
     with pytest.raises(ForeignCodeError, match="from the folder that is being loaded"):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     assert "somebodys_steps" not in sys.modules
 
 
@@ -261,10 +264,10 @@ def test_a_model_of_the_hub_is_fetched_checked_and_loaded_from_where_it_was_chec
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     snapshot = hub(tmp_path, monkeypatch, "somebody/policy", folder)
-    load(spec_of("somebody/policy"))
+    load(spec_of("somebody/policy"), ROBOT)
     insert(snapshot, popen(tmp_path / "ran"))
     with pytest.raises(ForeignCodeError) as error:
-        load(spec_of("somebody/policy"))
+        load(spec_of("somebody/policy"), ROBOT)
     assert str(snapshot / BEFORE) in str(error.value) and not (tmp_path / "ran").exists()
 
 
@@ -277,9 +280,9 @@ def test_code_beside_a_tokenizer_is_not_run_although_lerobot_allows_it(folder: P
     (repository / "config.json").write_text(json.dumps({"model_type": "evil", "auto_map": {"AutoConfig": "evil.Evil"}}))
     insert(folder, {"registry_name": "action_tokenizer_processor", "config": {"action_tokenizer_name": str(repository)}})
     with pytest.raises(CheckpointError, match=rf"wants its own code 'evil\.py'.*--trust {repository}"):
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     assert not (tmp_path / "ran").exists()
     trust([str(repository)])
     with pytest.raises(CheckpointError, match="Evil"):  # it is no processor
-        load(spec_of(folder))
+        load(spec_of(folder), ROBOT)
     assert (tmp_path / "ran").exists()

@@ -137,7 +137,7 @@ def test_a_folder_with_other_weights_beside_its_own_loads_its_own(folder: Path, 
     assert load_encoder(str(folder)).dimension == load_encoder("osel_small").dimension
 
 
-@pytest.mark.parametrize("content", [gzip.compress(b"x" * 5000), b"no gzip", gzip.compress(b"x" * 500)[:-9]])
+@pytest.mark.parametrize("content", [gzip.compress(b"x" * 5000), b"no gzip", gzip.compress(b"x" * 500)[:-9]], ids=["large", "no gzip", "cut off"])
 def test_a_vocabulary_is_not_inflated_without_a_bound(folder: Path, monkeypatch: pytest.MonkeyPatch, content: bytes) -> None:
     monkeypatch.setattr(open_clip_encoder, "MAX_VOCABULARY", 1000)
     (folder / VOCABULARY).write_bytes(content)

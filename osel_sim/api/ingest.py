@@ -1,6 +1,5 @@
 """Outcome tables of others as a rollout log."""
 
-import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,16 +11,14 @@ from osel_sim.api.results import frame
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Folder, Group, Names, NonNegative, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UsageError
 from osel_sim.core.trust import trusting
-from osel_sim.ingestion.mapping import VALUES
+from osel_sim.ingestion.columns import VALUES
 
 if TYPE_CHECKING:
     import pandas
 
     from osel_sim.formats.rollout_log import Row
-    from osel_sim.ingestion.mapping import Mapping
+    from osel_sim.ingestion.columns import Columns
     from osel_sim.selection.reward import RewardWeights
-
-logger = logging.getLogger(__name__)
 
 TABLE_FLAGS = ("text", "image", "group", "key", "policy_column", "repeat_column", "duplicates", "name", *VALUES)
 COLUMNS = Group("Columns of the tables, instead of --map (a column's name; numbers hold for every row)", 1)
@@ -113,6 +110,7 @@ class IngestResult:
         encoder: identity of the one whose contexts it has.
         weights: of the summary's rewards, and the preset's name.
         seconds: that it took.
+        notes: what was read and what was left out, in words.
     """
 
     folder: Path
@@ -120,6 +118,7 @@ class IngestResult:
     encoder: str
     weights: "tuple[RewardWeights, str]"
     seconds: float
+    notes: tuple[str, ...] = ()
 
     @cached_property
     def outcomes(self) -> "pandas.DataFrame":
@@ -164,9 +163,9 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.ingestion.write import IngestedInstance, check_out, load_image, write_log
 
     start = time.perf_counter()
-    mapping = _mapping(config, out)
-    records = read_tables(mapping)
-    converted = convert(mapping, records)
+    columns = _columns(config, out)
+    records = read_tables(columns)
+    converted = convert(columns, records)
     instances = []
     for source in converted.sources:
         for image in source.images:
@@ -180,20 +179,19 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
             )
         )
     inputs = check_out(out, instances)
-    logger.info("%d rows: %d instances, %d policies, %d outcomes", len(records), len(instances), len(converted.policies), len(converted.rows))
+    notes = [f"{len(records)} rows: {len(instances)} instances, {len(converted.policies)} policies, {len(converted.rows)} outcomes"]
     if converted.dropped:
-        differing = converted.differing or "none"
-        logger.info("%d duplicate rows left out, %s of which differed from the row that was kept", converted.dropped, differing)
-    name = config.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if mapping.images else TFIDF)
+        notes.append(f"{converted.dropped} duplicate rows left out, {converted.differing or 'none'} of which differed from the row that was kept")
+    name = config.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if columns.images else TFIDF)
     files = sorted({record.file for record in records})
     metadata = {
-        "task": mapping.name,
+        "task": columns.name,
         "policies": converted.policies,
         "source": {"metric": "table", "files": {file.name: file_digest(file) for file in files}},
     }
     texts = [item.text for item in instances]
-    identity = write_log(out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(mapping.images), config.device), metadata)
-    return _result(config, out, converted.rows, identity, start)
+    identity = write_log(out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(columns.images), config.device), metadata)
+    return _result(config, out, converted.rows, identity, start, tuple(notes))
 
 
 def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
@@ -203,11 +201,12 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.episodes.drivers import choose_policies
     from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
+    from osel_sim.sim.specification import specification
 
     start = time.perf_counter()
     if not config.dataset:
         raise SettingError("dataset", "is missing: give the folder of a LeRobotDataset")
-    specs = choose_policies(config.policies, config.policies_dir)
+    specs = choose_policies(config.policies, specification(), config.policies_dir)
     cameras = {}
     for item in config.camera or ():
         camera, equals, column = item.partition("=")
@@ -227,25 +226,26 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     return _result(config, out, rows, identity, start)
 
 
-def _mapping(config: IngestConfig, out: Path) -> "Mapping":
-    from osel_sim.ingestion.flags import as_table
-    from osel_sim.ingestion.mapping_file import load_mapping, parse_mapping
+def _columns(config: IngestConfig, out: Path) -> "Columns":
+    from osel_sim.ingestion.columns import COMMAND_LINE
+    from osel_sim.ingestion.columns_file import load_columns, parse_columns
+    from osel_sim.ingestion.flags import as_data
 
     files = config.files or ()
     if config.map is not None:
         _refuse(config, (*TABLE_FLAGS, "policies", "at_least"), "--map: write it into the file")
-        return load_mapping(config.map, files)
+        return load_columns(config.map, files)
     if not files:
         raise UsageError("--map or --files is missing: give a mapping file, or tables and what their columns mean")
     for name in ("text", "success"):
         if getattr(config, name) is None:
             raise SettingError(name, "is missing; python -m osel_sim.ingest --help shows examples")
-    return parse_mapping(as_table(config, files), Path())
+    return parse_columns(as_data(config, files), COMMAND_LINE, Path())
 
 
-def _result(config: IngestConfig, out: Path, rows: "list[Row]", encoder: str, start: float) -> IngestResult:
+def _result(config: IngestConfig, out: Path, rows: "list[Row]", encoder: str, start: float, notes: tuple[str, ...] = ()) -> IngestResult:
     from osel_sim.selection.reward import preset
 
     name = config.preset or ("oxe" if config.metric == "action-mse" else "mmlu")
     weights = replace(preset(name), success="score") if config.metric == "action-mse" else preset(name)
-    return IngestResult(out, rows, encoder, (weights, name), time.perf_counter() - start)
+    return IngestResult(out, rows, encoder, (weights, name), time.perf_counter() - start, notes)

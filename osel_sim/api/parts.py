@@ -30,9 +30,9 @@ def make_env(task: str, *, tasks: Path | str | None = None, **options: Any) -> "
     """Make a task's environment, a `gymnasium.Env`.
 
     Args:
-        task: name of a task file.
+        task: name of a task file. Environments of other suites: `osel_sim.suites.registry.find_task(name).open()`.
         tasks: folder with task files of your own.
-        options: split, level, axes, cameras, image_size, render_mode, as `osel_sim.sim.env.TaskEnv` takes them.
+        options: split, level, axes, cameras, image_size, render_mode, robot, as `osel_sim.sim.env.TaskEnv` takes them.
 
     Raises:
         UnknownNameError: no such task; names the nearest.
@@ -43,21 +43,26 @@ def make_env(task: str, *, tasks: Path | str | None = None, **options: Any) -> "
     return TaskEnv(select_tasks([task], None if tasks is None else Path(tasks))[0], **options)
 
 
-def load_policy(name: str, *, policies_dir: Path | str | None = None) -> "Policy":
+def load_policy(name: str, *, task: str | None = None, policies_dir: Path | str | None = None) -> "Policy":
     """Load a local policy, weights included, to be asked for actions: `reset(instruction)`, then `act(observation)`.
 
     Args:
         name: of a policy file. Of a remote one the checkpoint is loaded here, without server, network or price.
+        task: that it will drive in; None: any of our own.
         policies_dir: folder with policy files of your own.
 
     Raises:
-        UnknownNameError: no such policy; names the nearest.
+        UnknownNameError: no such policy or task; names the nearest.
+        ContentError: the policy's file does not fit the task's environment.
         CheckpointError: its checkpoint is missing, unreadable or does not fit its file.
     """
     from osel_sim.formats import library
     from osel_sim.policy.registry import make_policy
+    from osel_sim.sim.specification import specification
+    from osel_sim.suites.registry import find_task
 
-    return make_policy(library.load_policy(name, None if policies_dir is None else Path(policies_dir)))
+    environment = specification() if task is None else find_task(task).specification
+    return make_policy(library.load_policy(name, None if policies_dir is None else Path(policies_dir)), environment)
 
 
 def make_selector(name: str, policies: Sequence[str], context_dim: int, seed: int = 0, **settings: Any) -> "Selector":

@@ -27,9 +27,9 @@ class RecordConfig(InstanceSettings, ContentSettings):
     """Run every policy on the same instances and write the outcomes to a rollout log."""
 
     task: Annotated[Names, MAIN] = ()
-    """which tasks: names, tag:TAG, or all"""
+    """which tasks: names, tag:TAG, or all; of other suites SUITE:NAME"""
     policies: Annotated[Names | None, MAIN] = None
-    """policies to run (default: all there are)"""
+    """policies to run (default: all that fit the tasks)"""
     instances: Annotated[Count, MAIN] = 200
     """number of instances of each task"""
     repeats: Annotated[Count | None, MAIN] = None
@@ -70,12 +70,11 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
 
 def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordResult:
     from osel_sim.context.encoder import load_encoder
-    from osel_sim.core import content
     from osel_sim.core.files import read_json, write_json
     from osel_sim.episodes.declared_skills import declare
     from osel_sim.episodes.recording import Recording
-    from osel_sim.formats.run_config import RUN, check_run_folder, environment, start_or_resume
-    from osel_sim.sim.gl import choose_backend
+    from osel_sim.formats.run_config import RUN, check_run_folder, start_or_resume
+    from osel_sim.suites.ran_with import ran_with
 
     plan = _plan(config)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
@@ -87,7 +86,7 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
     configuration["encoder"] = encoder.identity
     # An encoder that was given is added; the one that was there must not have changed.
     known["encoder"] = before.get("configuration", {}).get("encoder") if before and encoder_given else encoder.identity
-    for warning in start_or_resume(folder, known, environment(choose_backend(), content.root()), config.resume, config.to_json()):
+    for warning in start_or_resume(folder, known, ran_with(plan.tasks), config.resume, config.to_json()):
         logger.warning(warning)
     recording = Recording(folder, plan, encoder.identity, skills)
     if recording.complete:
@@ -115,12 +114,12 @@ def _plan(config: RecordConfig) -> "Plan":
     from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
-    from osel_sim.formats.library import select_tasks
-    from osel_sim.sim.robots import with_robot
+    from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
-    policies = choose_policies(config.policies, config.policies_dir)
+    tasks = select_tasks(config.task, config.tasks, config.robot)
+    policies = choose_policies(config.policies, common_specification(tasks), config.policies_dir)
     return Plan(
-        tasks=tuple(with_robot(select_tasks(config.task, config.tasks), config.robot)),
+        tasks=tuple(tasks),
         policies=tuple(policies),
         everyone=tuple(with_fallbacks(policies, config.policies_dir)),
         seeds=range(config.start_seed, config.start_seed + config.instances),
@@ -129,7 +128,7 @@ def _plan(config: RecordConfig) -> "Plan":
         encoder=config.encoder or DEFAULT_ENCODER,
         repeats=config.repeats or 1,
         repeat_every=config.repeat_every or 1,
-        axes=parse_axes(config.axis),
+        axes=parse_axes(config.axis, known_axes(tasks)),
         action_noise=config.action_noise,
     )
 

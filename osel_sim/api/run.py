@@ -29,11 +29,12 @@ from osel_sim.core.trust import trusting
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.episodes.live import LiveRun
+    from osel_sim.episodes.run_subscribers import RunSubscriber
     from osel_sim.formats.policy_file import PolicySpec
-    from osel_sim.formats.task_file import TaskSpec
     from osel_sim.interface.encoder import Encoder
     from osel_sim.interface.policy import Policy
     from osel_sim.interface.selector import Selector
+    from osel_sim.interface.suite import Task
     from osel_sim.policy.objects import PolicyObject
     from osel_sim.selection.reward import RewardWeights
 
@@ -47,9 +48,9 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward."""
 
     task: Annotated[Names, MAIN] = ()
-    """which tasks, mixed at random: names, tag:TAG, or all"""
+    """which tasks, mixed at random: names, tag:TAG, or all; of other suites SUITE:NAME"""
     policies: Annotated[Names | None, MAIN] = None
-    """policies to choose from (default: all there are)"""
+    """policies to choose from (default: all that fit the tasks)"""
     selector: Annotated[str, MAIN] = "ppo"
     """ppo, auto, epsilon_greedy, random, fixed:POLICY ..."""
     episodes: Annotated[Count, MAIN] = 60
@@ -76,7 +77,7 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     @property
     def folder(self) -> Path:
         """Where to write."""
-        tasks = "-".join(name.replace(":", "-") for name in self.task)
+        tasks = "-".join(name.replace(":", "-").replace("/", "-") for name in self.task)
         robot = f"-{self.robot}" if self.robot else ""
         return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}-s{self.seed}{robot}"
 
@@ -95,6 +96,7 @@ def run(
     *,
     policies: "Sequence[str | Policy | PolicyObject] | None" = None,
     selector: "SelectorLike | None" = None,
+    subscribers: "Sequence[RunSubscriber]" = (),
     **values: Any,
 ) -> RunResult:
     """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward.
@@ -103,6 +105,7 @@ def run(
         config: settings as one object; `values` change some of them.
         policies: names of policy files, or objects with `reset` and `act` (`osel_sim.as_policy` says what they are shown and cost).
         selector: name of a selector, or a class or function of one's own: called with the policies' names, the context's length and the seed.
+        subscribers: what else watches the run (`osel_sim.episodes.run_subscribers`), beside progress, timings, TensorBoard and the page.
         values: settings by name, as `RunConfig` has them.
 
     Raises:
@@ -119,7 +122,7 @@ def run(
         factory = None if isinstance(selector, str) else selector
     config = RunConfig.of(**values) if config is None else config.changed(**values)
     with trusting(config.trust):
-        return _Run(config, objects, factory).execute()
+        return _Run(config, objects, factory, subscribers).execute()
 
 
 def _name(factory: Any) -> str:
@@ -132,36 +135,45 @@ class _Run:
     Args:
         objects: policies that no file describes.
         factory: makes the selector where it is none of the registry's.
+        watchers: subscribers of the caller's own.
     """
 
-    def __init__(self, config: RunConfig, objects: "Mapping[str, PolicyObject]", factory: "Callable[..., Selector] | None") -> None:
+    def __init__(
+        self,
+        config: RunConfig,
+        objects: "Mapping[str, PolicyObject]",
+        factory: "Callable[..., Selector] | None",
+        watchers: "Sequence[RunSubscriber]",
+    ) -> None:
         from osel_sim.api.reward import weights_of
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
-        from osel_sim.formats.levels import parse_axes, resolve, split_off
-        from osel_sim.formats.library import select_tasks
-        from osel_sim.sim.robots import with_robot
+        from osel_sim.formats.levels import parse_axes
+        from osel_sim.reporting.live_page import LivePage
+        from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
-        self.config, self.objects, self.factory = config, objects, factory
+        self.config, self.objects, self.factory, self.watchers = config, objects, factory, watchers
         if config.tensorboard:
             from osel_sim.episodes.tensorboard import check_installed
 
             check_installed()
-        self.tasks = with_robot(select_tasks(config.task, config.tasks), config.robot)
-        self.policies = choose_policies(config.policies, config.policies_dir, objects)
+        self.tasks = select_tasks(config.task, config.tasks, config.robot)
+        self.environment = common_specification(self.tasks)
+        self.policies = choose_policies(config.policies, self.environment, config.policies_dir, objects)
         self.everyone = with_fallbacks(self.policies, config.policies_dir)
         self.weights = weights_of(config)[0]
         self._check_selector()
-        self.axes = parse_axes(config.axis)
-        levels = (split_off(resolve(level, self.axes, task.axes, task.name))[1] for task in self.tasks for level in config.level)
-        self.axes_above = sorted({label for label in levels if label})
+        self.axes = parse_axes(config.axis, known_axes(self.tasks))
+        # Refuses an unknown level or axis before anything loads.
+        drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
+        self.axes_above = sorted({instance.axes for instance in drawn if instance.axes})
+        self.page = LivePage()
 
     def execute(self) -> RunResult:
         """Do it."""
         from osel_sim.context.encoder import load_encoder
         from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
-        from osel_sim.core import content
-        from osel_sim.formats.run_config import check_run_folder, environment, start_or_resume
-        from osel_sim.sim.gl import choose_backend
+        from osel_sim.formats.run_config import check_run_folder, start_or_resume
+        from osel_sim.suites.ran_with import ran_with
 
         config, folder = self.config, self.config.folder
         configuration = self._configuration()
@@ -169,28 +181,28 @@ class _Run:
         encoder = load_encoder(config.encoder or DEFAULT_ENCODER)
         configuration["encoder"] = encoder.identity
         seen = self._log(config.warm_start, encoder.identity) if config.warm_start else None
-        ran_with = environment(choose_backend(), content.root())
+        machine = ran_with(self.tasks)
 
         from osel_sim.core.torch_settings import threads
         from osel_sim.episodes.drivers import Drivers
-        from osel_sim.sim.task_envs import TaskEnvs
 
         # The last bits of a matrix product depend on the number of threads; one, so that a run does not depend on how many there are.
         with contextlib.ExitStack() as stack:
             stack.enter_context(threads(1))
             selector = self._selector(encoder, configuration)
             logger.info("%s: loading %s, starting servers ...", title(self.tasks), ", ".join(spec.name for spec in self.everyone))
-            drivers = stack.enter_context(Drivers(self.everyone, self.objects))
-            envs = stack.enter_context(contextlib.closing(TaskEnvs(self.tasks)))
+            drivers = stack.enter_context(Drivers(self.everyone, self.environment, self.objects))
             # Only now, when all that could be missing is there, is the folder taken into use.
-            for warning in start_or_resume(folder, configuration, ran_with, config.resume, config.to_json()):
+            for warning in start_or_resume(folder, configuration, machine, config.resume, config.to_json()):
                 logger.warning(warning)
-            live = self._live(folder, envs, encoder, drivers, selector)
+            live = self._live(folder, encoder, drivers, selector)
             stack.callback(live.close)
             if seen is not None:
                 self._start_warm(live, seen)
             live.replay()
-            interrupted = self._decide_all(live, stack)
+            with _Interrupt() as interrupt:
+                live.run(config.episodes, lambda: interrupt.asked)
+            interrupted = interrupt.asked and len(live.decisions) < config.episodes
         return self._finish(live, interrupted)
 
     def _check_selector(self) -> None:
@@ -251,14 +263,23 @@ class _Run:
 
         return read_log(folder, encoder).only([spec.name for spec in self.policies])
 
-    def _live(self, folder: Path, envs: Any, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
+    def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
         from osel_sim.episodes.live import LiveOptions, LiveRun
 
         config = self.config
-        options = LiveOptions(
-            config.seed, tuple(config.level), config.split, config.counterfactual, config.filmed, config.realtime, self.axes, config.action_noise
-        )
-        return LiveRun(folder, self.tasks, envs, encoder, drivers, selector, self.weights, options)
+        options = LiveOptions(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise)
+        return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder))
+
+    def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
+        """What watches the run."""
+        from osel_sim.episodes.progress import Progress
+        from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
+        from osel_sim.episodes.tensorboard import TensorBoard
+
+        config = self.config
+        films = [Films(folder, config.filmed)] if config.video else []
+        wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard)) if asked]
+        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), self.page]
 
     def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
@@ -266,35 +287,17 @@ class _Run:
 
         own = live.instance_keys(self.config.episodes)
         log = log.take([row for row, key in enumerate(log.keys) if key not in own])
-        count = show(live.selector, WarmStart(log.contexts, log.rewards(live.weights)), live.selector.policies, self.config.seed)
+        count = show(live.selector, WarmStart(log.contexts, log.rewards(self.weights)), live.selector.policies, self.config.seed)
         logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
 
-    def _decide_all(self, live: "LiveRun", stack: contextlib.ExitStack) -> bool:
-        """Make all decisions, with a progress bar. Returns whether Ctrl-C ended it: the decision at hand is finished first."""
-        from osel_sim.core.progress import progress
-
-        board = None
-        if self.config.tensorboard:
-            from osel_sim.episodes.tensorboard import TensorBoard
-
-            board = stack.enter_context(TensorBoard(live.folder))
-            board.update(live)
-        total = self.config.episodes
-        with _Interrupt() as interrupt, progress(total, "episode", initial=len(live.decisions)) as bar:
-            while len(live.decisions) < total and not interrupt.asked:
-                live.decide()
-                if board is not None:
-                    board.update(live)
-                bar.note(_progress(live))
-                bar.update()
-        return interrupt.asked
-
     def _finish(self, live: "LiveRun", interrupted: bool) -> RunResult:
-        """Write summary, curve, page and the selector's state."""
+        """Write summary, curve and the selector's state."""
         from osel_sim.api.run_files import write_results
 
-        summary, page = write_results(live, title(self.tasks), self.config.selector)
-        return RunResult(live.folder, summary, tuple(live.decisions), page, interrupted)
+        summary = write_results(live, title(self.tasks), self.config.selector)
+        if self.page.problem is not None:
+            logger.warning("no report.html: %s", self.page.problem)
+        return RunResult(live.folder, summary, tuple(live.decisions), self.page.file, interrupted)
 
 
 class _Interrupt:
@@ -322,13 +325,13 @@ class _Interrupt:
         logger.info("\nfinishing this decision; Ctrl-C again leaves at once")
 
 
-def title(tasks: "Sequence[TaskSpec]") -> str:
+def title(tasks: "Sequence[Task]") -> str:
     """What a run's tables and figures are headed."""
     return tasks[0].name if len(tasks) == 1 else f"{len(tasks)} tasks"
 
 
 def _declared(
-    config: RunConfig, tasks: "Sequence[TaskSpec]", policies: "Sequence[PolicySpec]", weights: "RewardWeights", encoder: "Encoder"
+    config: RunConfig, tasks: "Sequence[Task]", policies: "Sequence[PolicySpec]", weights: "RewardWeights", encoder: "Encoder"
 ) -> dict[str, Any]:
     """Settings by which a selector is told what policies declare, as far as it wants to know: what they cost, and what they were made for."""
     from osel_sim.episodes.declared_skills import declare
@@ -338,17 +341,8 @@ def _declared(
     wanted, known = setting_names(config.selector), dict[str, Any]()
     if "expected_costs" in wanted:
         # Half of the horizon is about what a success takes; how costs differ from task to task is learned.
-        actions = sum(task.horizon for task in tasks) // (2 * len(tasks))
-        known["expected_costs"] = expected_costs(policies, weights, max(1, actions))
+        actions = sum(task.info.horizon for task in tasks) // (2 * len(tasks))
+        known["expected_costs"] = expected_costs(policies, weights, max(1, actions), tasks[0].specification)
     if "skills" in wanted:
         known["skills"] = declare(policies, encoder, tasks, config.tasks)
     return known
-
-
-def _progress(live: "LiveRun") -> str:
-    decisions = live.decisions
-    rewards = [decision.reward for decision in decisions if decision.reward is not None]
-    successes = [decision.success for decision in decisions if decision.error is None]
-    shares = (f"{name} {100 * sum(decision.policy == name for decision in decisions) / len(decisions):.0f}%" for name in live.selector.policies)
-    mean = (f"reward {sum(rewards) / len(rewards):.3f}, success {100 * sum(successes) / len(successes):.0f}%",) if rewards else ()
-    return ", ".join((*mean, *shares))

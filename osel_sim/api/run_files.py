@@ -1,11 +1,7 @@
-"""What a live run writes when it ends: summary, learning curve, the selector's state, the page."""
+"""What a live run writes when it ends, beside its page: summary and the selector's state."""
 
 import logging
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from osel_sim.core.errors import OselError
-from osel_sim.core.files import write_bytes
 
 if TYPE_CHECKING:
     from osel_sim.episodes.live import LiveRun
@@ -13,19 +9,15 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-def write_results(live: "LiveRun", title: str, selector: str) -> tuple[dict[str, Any], Path | None]:
-    """Write them.
-
-    Returns:
-        the summary, and the page or None where it could not be written; both empty where no decision was made.
-    """
+def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
+    """Write them. Returns the summary, empty where no decision was made."""
     from osel_sim.core.files import write_json
     from osel_sim.formats.summary import summarise
     from osel_sim.selection.state import save_state
 
     if not live.decisions:
         logger.warning("no decision was made")
-        return {}, None
+        return {}
     policies = live.selector.policies
     chosen = [policies.index(decision.policy) for decision in live.decisions]
     summary = {"task": title, **summarise(live.decisions, policies, selector)}
@@ -33,20 +25,7 @@ def write_results(live: "LiveRun", title: str, selector: str) -> tuple[dict[str,
         summary |= _comparison(live, chosen)
     write_json(live.folder / "summary.json", summary)
     save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
-    return summary, _page(live.folder)
-
-
-def _page(folder: Path) -> Path | None:
-    from osel_sim.reporting.page import FIGURES, write_page
-    from osel_sim.reporting.run_page import run_page
-
-    try:
-        page = write_page(run_page(folder), folder)
-        write_bytes(folder / "curve.png", (folder / FIGURES / "curves.png").read_bytes())  # where one looks first
-        return page
-    except OselError as problem:  # the run itself is complete; python -m osel_sim.report tries again
-        logger.warning("no report.html: %s", problem)
-        return None
+    return summary
 
 
 def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:

@@ -76,6 +76,7 @@ class Command[Config: Settings]:
             help=inspect.getdoc(self.config) or "",
             help_format="plaintext",
             version_flags=[],
+            suppress_keyboard_interrupt=False,  # `reported` says that it was interrupted
             default_parameter=Parameter(negative="", consume_multiple=True, allow_repeating=True),
         )
         app["--help"].group = _group(OTHER)

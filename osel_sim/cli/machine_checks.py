@@ -1,4 +1,4 @@
-"""What `doctor` looks at: Python, packages, display, machine, tasks, policies and the encoder."""
+"""What `doctor` looks at: Python, packages, display, machine, tasks, suites, policies and the encoder."""
 
 import importlib.metadata
 import os
@@ -10,12 +10,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from osel_sim.core import content
-from osel_sim.core.errors import ContentError, DataError, DisplayError
+from osel_sim.core.errors import ContentError, DataError, DisplayError, OselError
 from osel_sim.core.files import read_json
 from osel_sim.core.shown import shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.policy.environment_fit import misfits
 from osel_sim.sim.robots import with_robot
+from osel_sim.sim.specification import specification
+from osel_sim.suites import SUITES
+from osel_sim.suites.registry import load_suite
 
 DISTRIBUTION = "osel-sim"
 CONFIG = "config.json"
@@ -28,7 +32,7 @@ class Check:
     """One thing looked at.
 
     Attributes:
-        area: python, packages, display, machine, tasks, policies, encoder.
+        area: python, packages, display, machine, tasks, suites, policies, encoder.
         name: what was looked at.
         found: what was found, in words.
         state: `ok`, `note` (good to know, nothing is blocked) or `missing` (a run needs it).
@@ -49,7 +53,7 @@ def examine(tasks: Path | None = None, policies: Path | None = None) -> list[Che
         tasks: a folder of the user's own task files.
         policies: a folder of the user's own policy files.
     """
-    return [*_python(), *_packages(), *_display(), *_machine(), *_tasks(tasks), *_policies(policies), *_encoder()]
+    return [*_python(), *_packages(), *_display(), *_machine(), *_tasks(tasks), *_suites(), *_policies(policies), *_encoder()]
 
 
 def _python() -> Iterator[Check]:
@@ -151,13 +155,26 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
             yield Check("tasks", name, str(error), MISSING, f"correct {file.name}")
 
 
+def _suites() -> Iterator[Check]:
+    """Suites of others that are installed; nothing of ours needs one."""
+    for name in SUITES.others():
+        try:
+            suite = load_suite(name)
+            yield Check("suites", name, f"{suite.spec.title}, {len(suite.tasks)} tasks")
+        except OselError as error:
+            yield Check("suites", name, str(error), NOTE)
+
+
 def _policies(folder: Path | None) -> Iterator[Check]:
     found = content.files("policies", folder)
     if not found:
         yield Check("policies", "none", f"no policy file in {content.root() / 'policies'}", MISSING, _install(DISTRIBUTION))
     for name, file in found.items():
         try:
-            yield _checkpoint(load_policy_file(file))
+            spec = load_policy_file(file)
+            yield _checkpoint(spec)
+            for key, problem in misfits(spec, specification()):
+                yield Check("policies", name, f"is for other suites than ours, or wrong: {key}: {problem}", NOTE)
         except ContentError as error:
             yield Check("policies", name, str(error), MISSING, f"correct {file.name}")
 

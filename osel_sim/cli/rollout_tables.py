@@ -21,9 +21,9 @@ SPLITS: dict[str, Callable[[Row], str | None]] = {
     "robot": lambda row: row.robot or DEFAULT_ROBOT,
     "level": lambda row: None if row.level is None else label(row.level, row.axes),
     "task at level": lambda row: None if row.level is None else f"{row.task} {label(row.level, row.axes)}",
-    "object": lambda row: row.target,
-    "container": lambda row: row.container,
-    "phrasing": lambda row: None if row.phrasing is None else row.phrasing.rpartition("-")[0].replace("_", "-") or row.phrasing,
+    "object": lambda row: row.target or None,
+    "container": lambda row: row.container or None,
+    "phrasing": lambda row: None if not row.phrasing else row.phrasing.rpartition("-")[0].replace("_", "-") or row.phrasing,
 }
 """What the rows are split by; None where a log from elsewhere does not have it."""
 

@@ -67,7 +67,7 @@ class ContextCache:
     def skills(self, encoder: str) -> list[str]:
         """Names of the skills that have examples here, sorted."""
         known = self._contexts.get(self._identity(encoder), {})
-        return sorted({key.split(":")[1] for key in known if key.startswith(EXAMPLE)})
+        return sorted({key.removeprefix(EXAMPLE).rpartition(":")[0] for key in known if key.startswith(EXAMPLE)})
 
     def put_examples(self, encoder: str, skill: str, contexts: Sequence[Context]) -> None:
         """Set the examples of a skill."""

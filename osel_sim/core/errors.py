@@ -1,4 +1,4 @@
-"""Typed errors. Every one of them is the user's to read: commands print its message as one line and exit with `exit_code`."""
+"""Typed errors. Every one of them is the user's to read: commands print its message and exit with `exit_code`."""
 
 import difflib
 from collections.abc import Callable, Iterable
@@ -33,11 +33,23 @@ class UnknownNameError(UsageError):
         super().__init__(f"unknown {what} {name!r}: {did_you_mean(name, known)}{listing}")
 
 
-class ContentError(OselError):
-    """A task or policy file is wrong. The message names the file, the key and what would be right."""
+class MissingPackageError(UsageError):
+    """Something was asked for that needs a package which is not installed."""
 
-    def __init__(self, file: object, key: str, problem: str) -> None:
-        super().__init__(f"{file}: {key}: {problem}")
+    def __init__(self, what: str, package: str, install: str = "") -> None:
+        super().__init__(f"{what} needs the package {package!r}, which is not installed: {install or f'pip install {package}'}")
+
+
+class ContentError(OselError):
+    """A task, policy or other TOML file is wrong. The message has a line for each fault: the file, the key and what would be right.
+
+    Attributes:
+        faults: (key, problem) of each.
+    """
+
+    def __init__(self, file: object, key: str, problem: str, *more: tuple[str, str]) -> None:
+        self.faults = ((key, problem), *more)
+        super().__init__("\n".join(f"{file}: {key}: {problem}" for key, problem in self.faults))
 
 
 class CheckpointError(OselError):

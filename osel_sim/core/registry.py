@@ -10,7 +10,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
-from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.core.errors import MissingPackageError, OselError, UnknownNameError, UsageError
 
 
 class Registry[T]:
@@ -26,11 +26,14 @@ class Registry[T]:
     def __init__(self, what: str, group: str, built_in: Mapping[str, str], kind: type[T] | None = None) -> None:
         self.what, self.group = what, group
         self._built_in, self._kind = built_in, kind
-        self._loaded: dict[str, T] = {}
 
     def locations(self) -> dict[str, str]:
         """Name -> `module:attribute` of all there are."""
         return {name: points[0].value for name, points in self._plugins().items()} | dict(self._built_in)
+
+    def others(self) -> list[str]:
+        """Names of those that other packages bring, sorted."""
+        return sorted(name for name in self._plugins() if name not in self._built_in)
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.locations())
@@ -46,15 +49,14 @@ class Registry[T]:
 
         Raises:
             UnknownNameError: there is none of that name.
+            MissingPackageError: it needs a package that is not installed.
             UsageError: it cannot be imported, is of another kind, or two packages offer it; names the package and the cause.
         """
         if name in self._built_in:
             location, source = self._built_in[name], ""
         else:
             location, source = self._location(name, where)
-        if location not in self._loaded:
-            self._loaded[location] = self._import(name, location, source)
-        return self._loaded[location]
+        return self._import(name, location, source)
 
     def _location(self, name: str, where: str) -> tuple[str, str]:
         """Where a plugin lies, and whose it is."""
@@ -69,6 +71,10 @@ class Registry[T]:
         module, _, attribute = location.partition(":")
         try:
             found: Any = functools.reduce(getattr, attribute.split("."), import_module(module))
+        except OselError:
+            raise
+        except ModuleNotFoundError as error:
+            raise MissingPackageError(f"{self.what} {name!r}{source}", (error.name or str(error)).partition(".")[0]) from error
         except Exception as error:  # a plugin may raise anything while it is imported
             raise UsageError(f"{self.what} {name!r}{source}: cannot import {location} ({type(error).__name__}: {error})") from error
         if self._kind is not None and not isinstance(found, self._kind):

@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from osel_sim.core import content
-from osel_sim.core.errors import ContentError, DataError, UnknownNameError
+from osel_sim.core.errors import ContentError, DataError, UsageError
 from osel_sim.core.files import read_json
 from osel_sim.core.torch_settings import threads
-from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.encoder import Encoder
+from osel_sim.interface.suite import Task
 from osel_sim.selection.skills import Skills
-from osel_sim.sim.instance import make_instance
+from osel_sim.suites.registry import select_tasks
 
 TRAINING = "training.json"
 EXAMPLES = 8
@@ -35,8 +34,8 @@ def declared_skills(spec: PolicySpec, tasks: Path | None = None) -> tuple[str, .
     """
     if spec.skills is not None:
         try:
-            return tuple(task.name for task in library.select_tasks(spec.skills, tasks))
-        except UnknownNameError as error:
+            return tuple(task.name for task in select_tasks(spec.skills, tasks))
+        except UsageError as error:  # no such suite, or a package of it is missing
             raise ContentError(spec.file, "skills", str(error)) from None
     checkpoint = content.resolve_checkpoint(spec.checkpoint) if spec.checkpoint else None
     if not isinstance(checkpoint, Path):
@@ -49,11 +48,11 @@ def declared_skills(spec: PolicySpec, tasks: Path | None = None) -> tuple[str, .
     return tuple(dict.fromkeys(name for name in trained if isinstance(name, str) and name in known)) or None
 
 
-def declare(policies: Sequence[PolicySpec], encoder: Encoder, asked: Sequence[TaskSpec], tasks: Path | None = None) -> Skills | None:
+def declare(policies: Sequence[PolicySpec], encoder: Encoder, asked: Sequence[Task], tasks: Path | None = None) -> Skills | None:
     """What policies declare, with examples in an encoder's eyes; None if none of them declares anything.
 
-    Examples are instructions of the train split with a blank image: of what is declared, and of what will be asked, lest a task that nobody declares
-    be taken for the nearest that somebody does.
+    Examples are clean instructions of the train split (the first split of a suite that has none) with a blank image: of what is declared, and of
+    what will be asked, lest a task that nobody declares be taken for the nearest that somebody does.
 
     Args:
         asked: tasks that will be asked for.
@@ -66,11 +65,13 @@ def declare(policies: Sequence[PolicySpec], encoder: Encoder, asked: Sequence[Ta
     able = {policy: names for policy, names in declared.items() if names is not None}
     if not able:
         return None
-    wanted = {task.name: task for task in [*library.select_tasks(sorted({name for own in able.values() for name in own}), tasks), *asked]}
+    wanted = {task.name: task for task in [*select_tasks(sorted({name for own in able.values() for name in own}), tasks), *asked]}
     blank = np.zeros((encoder.image_size, encoder.image_size, 3), np.uint8)
     examples = {}
     with threads(1):
         for name, task in sorted(wanted.items()):
-            texts = [make_instance(task, seed, 0, "train").instruction for seed in range(EXAMPLES)]
+            suite = task.suite.spec
+            split = "train" if "train" in suite.splits else suite.splits[0]
+            texts = [task.instance(seed, suite.levels[0], split).instruction for seed in range(EXAMPLES)]
             examples[name] = np.stack([encoder.encode([blank], text) for text in texts])
     return Skills(examples, able)

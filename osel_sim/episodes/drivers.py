@@ -1,5 +1,6 @@
 """Policies made ready to drive: local ones loaded, servers of remote ones started, fallbacks found."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,23 +11,36 @@ from osel_sim.core.errors import ContentError, OselError, UsageError
 from osel_sim.episodes.loop import Driver
 from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.environment import EnvironmentSpec
+from osel_sim.policy.environment_fit import check_environment, misfits
 from osel_sim.policy.objects import PolicyObject
 
+logger = logging.getLogger(__name__)
 
-def choose_policies(names: Sequence[str] | None, folder: Path | None = None, objects: Mapping[str, PolicyObject] | None = None) -> list[PolicySpec]:
-    """Policy files by name, or all there are that see no more than a robot could.
+
+def choose_policies(
+    names: Sequence[str] | None, environment: EnvironmentSpec, folder: Path | None = None, objects: Mapping[str, PolicyObject] | None = None
+) -> list[PolicySpec]:
+    """Policy files by name, or all that fit the environment and see no more than a robot could; the log says which are left out.
 
     Args:
+        environment: what they are to drive.
+        folder: the user's own policy files.
         objects: policies that no file describes, by name.
 
     Raises:
         UnknownNameError: no such policy.
         UsageError: a policy is named twice, or there is none at all.
-        ContentError: a file is wrong.
+        ContentError: a file is wrong, or one that is named does not fit the environment.
     """
     if names is None:
-        specs = [library.load_policy(name, folder) for name in content.files("policies", folder)]
+        unfit = left_out(environment, folder)
+        specs = [library.load_policy(name, folder) for name in content.files("policies", folder) if name not in unfit]
         names = [spec.name for spec in specs if not spec.is_privileged]
+        if unfit:
+            logger.info("not made for the environment of %s, and left out: %s (naming one says why)", environment.name, ", ".join(unfit))
+        if not names and unfit:
+            raise UsageError(f"no policy there is drives in the environment of {environment.name}, such as {next(iter(unfit.values()))}")
     wanted = list(names)
     if not wanted:
         raise UsageError("no policies: name at least one after --policies")
@@ -34,7 +48,25 @@ def choose_policies(names: Sequence[str] | None, folder: Path | None = None, obj
         if wanted.count(name) > 1:
             raise UsageError(f"policy {name!r} is named twice after --policies")
     at_hand = objects or {}
-    return [at_hand[name].spec if name in at_hand else library.load_policy(name, folder) for name in wanted]
+    found = [at_hand[name].spec_for(environment) if name in at_hand else library.load_policy(name, folder) for name in wanted]
+    for spec in found:
+        check_environment(spec, environment)
+    return found
+
+
+def left_out(environment: EnvironmentSpec, folder: Path | None = None) -> dict[str, str]:
+    """Policies, of those that see no more than a robot could, that do not fit an environment -> why.
+
+    Raises:
+        ContentError: a file is wrong.
+    """
+    found = {}
+    for name in content.files("policies", folder):
+        spec = library.load_policy(name, folder)
+        problem = next(misfits(spec, environment), None)
+        if problem is not None and not spec.is_privileged:
+            found[name] = f"{spec.file}: {problem[0]}: {problem[1]}"
+    return found
 
 
 def with_fallbacks(specs: Sequence[PolicySpec], folder: Path | None = None) -> list[PolicySpec]:
@@ -63,31 +95,35 @@ class Drivers:
 
     Args:
         specs: the policies and their fallbacks (`with_fallbacks`).
+        environment: what they are to drive.
         objects: those of them that no file describes, by name.
 
     Raises:
+        ContentError: a policy's file does not fit the environment.
         CheckpointError: a policy cannot be loaded.
         RemoteError: a server cannot be started or reached.
     """
 
-    def __init__(self, specs: Sequence[PolicySpec], objects: Mapping[str, PolicyObject] | None = None) -> None:
+    def __init__(self, specs: Sequence[PolicySpec], environment: EnvironmentSpec, objects: Mapping[str, PolicyObject] | None = None) -> None:
+        from osel_sim.policy.expert import ExpertCaller
         from osel_sim.policy.local import LocalCaller
         from osel_sim.policy.registry import make_policy
         from osel_sim.remote.policy import open_remote
-        from osel_sim.sim.expert_caller import ExpertCaller
 
+        for spec in specs:
+            check_environment(spec, environment)
         remote = [spec for spec in specs if spec.is_remote]
         self._drivers: dict[str, Driver] = {}
         # Servers load their weights in their own processes meanwhile.
         with ThreadPoolExecutor(max(1, len(remote))) as pool:
-            opening = [(spec, pool.submit(open_remote, spec)) for spec in remote]
+            opening = [(spec, pool.submit(open_remote, spec, environment)) for spec in remote]
             problem: OselError | None = None
             try:
                 for spec in specs:
                     if not spec.is_remote:
                         at_hand = (objects or {}).get(spec.name)
-                        policy = None if spec.is_privileged else at_hand.policy if at_hand else make_policy(spec)
-                        caller = ExpertCaller(spec) if policy is None else LocalCaller(policy, spec)
+                        policy = None if spec.is_privileged else at_hand.policy if at_hand else make_policy(spec, environment)
+                        caller = ExpertCaller(spec) if policy is None else LocalCaller(policy, spec, environment)
                         self._drivers[spec.name] = Driver(spec, caller)
             except OselError as error:
                 problem = error

@@ -1,35 +1,34 @@
 """The live loop: instance, context, choice, episode, reward, learning; one decision after another."""
 
-import time
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.episodes.drivers import Drivers
-from osel_sim.episodes.loop import Subscriber, run_episode
-from osel_sim.episodes.subscribers import RealTime, Timing
-from osel_sim.episodes.video import Video
+from osel_sim.episodes.loop import run_episode
+from osel_sim.episodes.run_subscribers import RunSubscriber
+from osel_sim.episodes.start import Start
 from osel_sim.episodes.view import view
 from osel_sim.formats.journal import Decision, Lines, to_decision
-from osel_sim.formats.task_file import TaskSpec
+from osel_sim.interface.encoder import Encoder
+from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.selector import Choice, Selector
+from osel_sim.interface.suite import Task
 from osel_sim.selection.reward import RewardWeights, reward
-
-if TYPE_CHECKING:
-    from osel_sim.interface.encoder import Encoder
-    from osel_sim.sim.instance import Instance
-    from osel_sim.sim.task_envs import TaskEnvs
+from osel_sim.suites.open_tasks import OpenTasks
 
 SEEDS_PER_RUN = 1_000_000
 """Decision t of run seed s is made on the instance of seed s * 1,000,000 + t: no two runs share an instance."""
 
-JOURNAL, TIMING, COUNTERFACTUAL = "episodes.jsonl", "timing.jsonl", "counterfactual.jsonl"
+JOURNAL, COUNTERFACTUAL = "episodes.jsonl", "counterfactual.jsonl"
 
 
 @dataclass(frozen=True)
@@ -37,26 +36,27 @@ class LiveOptions:
     """What a live run does, besides the parts it is made of.
 
     Attributes:
-        counterfactual: also run the policies that were not chosen, from the same snapshot, for comparison only.
-        video: indices of the decisions to film.
-        realtime: sleep so that control steps happen at 20 Hz.
+        weights: of the reward.
+        counterfactual: also run the policies that were not chosen, from the same start, for comparison only.
         levels: of which each instance has one, at random.
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
     """
 
     seed: int
+    weights: RewardWeights
     levels: tuple[int, ...] = (0,)
     split: str = "test"
     counterfactual: bool = False
-    video: frozenset[int] = frozenset()
-    realtime: bool = False
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
 
 
 class LiveRun:
-    """One run in one folder. Made on a folder with a journal, it learns from that first and goes on after it.
+    """One run in one folder. Made on a folder with a journal, it learns from that first and goes on after it. Close it.
+
+    Args:
+        subscribers: watch it (`osel_sim.episodes.run_subscribers`); the run itself writes its journal, counterfactual outcomes and contexts only.
 
     Attributes:
         decisions: all so far.
@@ -66,28 +66,48 @@ class LiveRun:
     def __init__(
         self,
         folder: Path,
-        tasks: Sequence[TaskSpec],
-        envs: "TaskEnvs",
-        encoder: "Encoder",
+        tasks: Sequence[Task],
+        encoder: Encoder,
         drivers: Drivers,
         selector: Selector,
-        weights: RewardWeights,
         options: LiveOptions,
+        subscribers: Sequence[RunSubscriber] = (),
     ) -> None:
-        from osel_sim.context.cache import ContextCache
-
-        self.folder, self.tasks, self.envs, self.encoder, self.cache = folder, tasks, envs, encoder, ContextCache(folder)
-        self.drivers, self.selector, self.weights, self.options = drivers, selector, weights, options
+        self.folder, self.tasks, self.encoder = folder, tasks, encoder
+        self.drivers, self.selector, self.options = drivers, selector, options
+        self.subscribers = subscribers
+        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder)
         self._journal = Lines(folder / JOURNAL)
         self.decisions = [to_decision(data, index, self._journal.file) for index, (data, _) in enumerate(self._journal.rows)]
-        self._timing = Lines(folder / TIMING, keep=len(self.decisions))
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
         self._rows: list[list[float]] = []
 
     @property
+    def policies(self) -> Sequence[str]:
+        """Names of the policies that are chosen from."""
+        return self.selector.policies
+
+    @property
     def rewards(self) -> NDArray[np.float64]:
         """(decisions, policies), in the order of the selector's policies."""
-        return np.array(self._rows, np.float64).reshape(-1, len(self.selector.policies))
+        return np.array(self._rows, np.float64).reshape(-1, len(self.policies))
+
+    def run(self, decisions: int, stop: Callable[[], bool] = lambda: False) -> None:
+        """Make decisions until there are so many, or `stop` says so. The run is closed then; its subscribers are told of all of it.
+
+        Args:
+            stop: asked before each decision.
+        """
+        with contextlib.ExitStack() as stack:
+            for subscriber in self.subscribers:
+                stack.callback(subscriber.close)
+            with contextlib.closing(self):
+                for subscriber in self.subscribers:
+                    subscriber.on_start(self)
+                while len(self.decisions) < decisions and not stop():
+                    self.decide()
+            for subscriber in self.subscribers:
+                subscriber.on_end(self)
 
     def replay(self) -> None:
         """Let the selector live through the journal, so that it is what it was when the run was cut off.
@@ -114,40 +134,26 @@ class LiveRun:
 
     def decide(self) -> Decision:
         """Make the next decision and write it down."""
-        start = time.perf_counter()
         index = len(self.decisions)
+        for subscriber in self.subscribers:
+            subscriber.on_instance(index)
         instance = self._instance(index)
-        env = self.envs[instance.task]
-        env.load(instance)
-        snapshot = env.snapshot()
+        start = Start(self.envs[instance.task], instance)
         context = self._context(instance, loaded=True)
         choice = self.selector.select(context)
-        selected = time.perf_counter()
-        timings: dict[str, Timing] = {}
-
-        def run(policy: str, chosen: bool) -> Outcome:
-            env.restore(snapshot)
-            timings[policy] = Timing()
-            listeners = [timings[policy], *self._listeners(index, policy)] if chosen else [timings[policy]]
-            return run_episode(env, instance, self.drivers[policy], self.drivers.fallback(policy), listeners, action_noise=self.options.action_noise)
-
-        outcome = run(choice.policy, chosen=True)
+        for subscriber in self.subscribers:
+            subscriber.on_choice(index, choice.policy)
+        outcome = self._episode(index, instance, start, choice.policy, chosen=True)
         decision = self._decision(index, instance, choice, outcome)
         rewards = {choice.policy: decision.reward}
         if self._others is not None:
-            others = {policy: run(policy, chosen=False) for policy in self.selector.policies if policy != choice.policy}
+            others = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in self.policies if policy != choice.policy}
             rewards |= {policy: self._reward(other) for policy, other in others.items()}
             self._others.append(
                 {"index": index, "policies": {policy: {**other.to_dict(), "reward": rewards[policy]} for policy, other in others.items()}}
             )
-        self._timing.append(
-            {
-                "index": index,
-                "seconds": time.perf_counter() - start,
-                "context_and_choice": selected - start,
-                "episodes": {policy: {"seconds": timing.seconds, "calls": timing.calls} for policy, timing in timings.items()},
-            }
-        )
+        for subscriber in self.subscribers:
+            subscriber.on_decision(decision, rewards)
         # The journal comes last: what it does not have did not happen.
         self._journal.append(decision.to_dict())
         self.decisions.append(decision)
@@ -160,22 +166,28 @@ class LiveRun:
         return frozenset(self._instance(index).key for index in range(count))
 
     def close(self) -> None:
-        """Close the files and write the contexts."""
+        """Close the files and the environments, and write the contexts. May be called twice."""
         self.cache.save()
-        for lines in (self._journal, self._timing, self._others):
+        self.envs.close()
+        for lines in (self._journal, self._others):
             if lines is not None:
                 lines.close()
 
-    def _instance(self, index: int) -> "Instance":
-        from osel_sim.sim.instance import make_instance
+    def _episode(self, index: int, instance: Instance, start: Start, policy: str, chosen: bool) -> Outcome:
+        """One policy on the instance, from its beginning."""
+        start.again()
+        watching = [listener for subscriber in self.subscribers for listener in subscriber.watch(index, policy, chosen)]
+        env, fallback = self.envs[instance.task], self.drivers.fallback(policy)
+        return run_episode(env, instance, self.drivers[policy], fallback, watching, action_noise=self.options.action_noise)
 
+    def _instance(self, index: int) -> Instance:
         options = self.options
         chance = np.random.default_rng([options.seed, index])
         task = self.tasks[int(chance.integers(len(self.tasks)))]
         level = options.levels[int(chance.integers(len(options.levels)))]
-        return make_instance(task, options.seed * SEEDS_PER_RUN + index, level, options.split, options.axes)
+        return task.instance(options.seed * SEEDS_PER_RUN + index, level, options.split, options.axes)
 
-    def _context(self, instance: "Instance", loaded: bool) -> NDArray[np.float32]:
+    def _context(self, instance: Instance, loaded: bool) -> NDArray[np.float32]:
         def images() -> list[NDArray[np.uint8]]:
             env = self.envs[instance.task]
             if not loaded:
@@ -184,26 +196,18 @@ class LiveRun:
 
         return self.cache.encode(self.encoder, instance.key, images, instance.instruction)
 
-    def _listeners(self, index: int, policy: str) -> Sequence[Subscriber]:
-        listeners: list[Subscriber] = []
-        if index in self.options.video:
-            listeners.append(Video(self.folder / "videos" / f"{index:05d}-{policy}.mp4"))
-        if self.options.realtime:
-            listeners.append(RealTime())
-        return listeners
-
     def _reward(self, outcome: Outcome) -> float | None:
-        return None if outcome.error is not None else reward(outcome, self.weights)
+        return None if outcome.error is not None else reward(outcome, self.options.weights)
 
     def _learn(self, context: NDArray[np.float32], choice: Choice, value: float | None) -> None:
         if value is not None:  # an error teaches nothing
             self.selector.update(context, choice, value)
 
     def _remember(self, rewards: dict[str, float | None]) -> None:
-        row = [rewards.get(policy) for policy in self.selector.policies]
+        row = [rewards.get(policy) for policy in self.policies]
         self._rows.append([float("nan") if value is None else value for value in row])
 
-    def _decision(self, index: int, instance: "Instance", choice: Choice, outcome: Outcome) -> Decision:
+    def _decision(self, index: int, instance: Instance, choice: Choice, outcome: Outcome) -> Decision:
         own: dict[str, Any] = {key: value for key, value in vars(outcome).items() if key not in ("fallback", "error")}
         return Decision(
             index=index,

@@ -1,32 +1,29 @@
-"""One episode: a policy drives the robot through one instance, on a virtual clock of 20 Hz control steps.
+"""One episode: a policy drives the robot through one instance, on a virtual clock of control steps.
 
-The world does not wait for an answer. A call of d seconds takes ceil(20 d) control steps, in which the robot
+The world does not wait for an answer. At a control rate of f Hz a call of d seconds takes ceil(f d) control steps, in which the robot
 
 - holds still (`blocking`), then executes the first `execute` actions of the answer; or
 - finishes the chunk it has (`async`): after `execute` actions the next call is sent, and until it is answered the rest of the old chunk is executed,
   then the robot holds still. Of the answer it skips as many actions as it made meanwhile, since both chunks planned them for the same moments.
 
-A local policy that answers within one control step (50 ms) takes none: it computes while the step runs, as control loops do.
+A local policy that answers within one control step takes none: it computes while the step runs, as control loops do.
 
-The loop knows nothing of videos, progress bars or timings: those are subscribers.
+The loop knows what policies and environments are (`osel_sim.interface`) and nothing of simulators; videos, progress bars and timings are subscribers.
 """
 
 import hashlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.call import Call, Caller, Privileged
+from osel_sim.interface.environment import ActionSpec, Environment, TakesChunks
+from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome, Seconds
-from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, Actions
-
-if TYPE_CHECKING:
-    from osel_sim.sim.env import TaskEnv
-    from osel_sim.sim.instance import Instance
+from osel_sim.interface.policy import Actions
 
 
 @dataclass(frozen=True)
@@ -49,8 +46,8 @@ class Frame:
         price: cents so far.
     """
 
-    env: "TaskEnv"
-    instance: "Instance"
+    env: Environment
+    instance: Instance
     policy: str
     steps: int
     waiting: bool
@@ -67,7 +64,7 @@ class Subscriber:
         """A policy was asked and answered (or failed to)."""
 
     def on_step(self, frame: Frame) -> None:
-        """One control step was made."""
+        """One control step was made. Overriding this costs an environment that takes chunks a message a step."""
 
     def on_end(self, outcome: Outcome) -> None:
         """The episode is over, also after an error."""
@@ -78,15 +75,15 @@ def episode_seed(instance_key: str, policy: str, repeat: int) -> tuple[int, ...]
     return (*(int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") for text in (instance_key, policy)), repeat)
 
 
-def delay_steps(call: Call, remote: bool) -> int:
+def delay_steps(call: Call, remote: bool, control_hz: float) -> int:
     """Control steps that pass before the answer is there."""
-    steps = math.ceil(round(call.seconds * CONTROL_HZ, 6))  # rounded: 0.3 s is 6 steps, not 7 for 6.000000000000001
+    steps = math.ceil(round(call.seconds * control_hz, 6))  # rounded: 0.3 s is 6 steps, not 7 for 6.000000000000001
     return steps if remote or steps > 1 else 0
 
 
 def run_episode(
-    env: "TaskEnv",
-    instance: "Instance",
+    env: Environment,
+    instance: Instance,
     driver: Driver,
     fallback: Driver | None = None,
     subscribers: Sequence[Subscriber] = (),
@@ -101,13 +98,14 @@ def run_episode(
     Args:
         env: holds `instance`, just loaded or restored.
         repeat: number of this episode among those of the same policy on the same instance.
-        action_noise: standard deviation of Gaussian noise on the six motions of every action a policy makes, in units of action, >= 0. Without it an
-            episode differs from its repeat in the network's delays at most, and a local policy's not at all.
+        action_noise: standard deviation of Gaussian noise on the motions of every action a policy makes, as a share of half their range (1, where
+            that is [-1, 1]), >= 0. Without it an episode differs from its repeat in the network's delays at most, and a local policy's not at all.
 
     Returns:
         the outcome. `calls` and `actions` are the driver's own; `price` and `seconds` contain the fallback's.
     """
-    episode = _Episode(env, instance, subscribers, _Noise(action_noise, (*episode_seed(instance.key, driver.spec.name, repeat), 1)))
+    noise = _Noise(action_noise, env.specification.action, (*episode_seed(instance.key, driver.spec.name, repeat), 1))
+    episode = _Episode(env, instance, subscribers, noise)
     fallback_reason: str | None = None
     error: str | None = None
     try:
@@ -143,22 +141,26 @@ class _Tally:
 class _Noise:
     """What the arm makes of an action: the robot's own inaccuracy, which no policy sees coming. The gripper only opens and closes."""
 
-    def __init__(self, deviation: float, seed: tuple[int, ...]) -> None:
-        self._deviation, self._random = deviation, np.random.default_rng(seed)
+    def __init__(self, deviation: float, spec: ActionSpec, seed: tuple[int, ...]) -> None:
+        self._spec, self._motions, self._random = spec, spec.motions, np.random.default_rng(seed)
+        self._deviation = deviation * spec.half_range[spec.motions] if deviation else None
 
     def __call__(self, action: Actions) -> Actions:
-        if self._deviation == 0.0:
+        if self._deviation is None:
             return action
         action = action.copy()
-        action[:-1] += self._deviation * self._random.standard_normal(ACTION_DIM - 1)
-        return np.clip(action, -1.0, 1.0)
+        action[self._motions] += self._deviation * self._random.standard_normal(len(self._motions))
+        return self._spec.clip(action)
 
 
 class _Episode:
     """The running state of one episode."""
 
-    def __init__(self, env: "TaskEnv", instance: "Instance", subscribers: Sequence[Subscriber], noise: _Noise) -> None:
+    def __init__(self, env: Environment, instance: Instance, subscribers: Sequence[Subscriber], noise: _Noise) -> None:
         self.env, self.instance, self.subscribers, self.noise = env, instance, subscribers, noise
+        self.spec = env.specification
+        watched = any(type(subscriber).on_step is not Subscriber.on_step for subscriber in subscribers)
+        self.chunked = env if isinstance(env, TakesChunks) and not watched else None
         self.policy = ""
         self.tallies: list[_Tally] = []  # the driver's, then the fallback's
         self.upload = self.inference = self.download = 0.0
@@ -173,20 +175,18 @@ class _Episode:
             frame = self._frame(waiting=False)
             self._tell(lambda subscriber: subscriber.on_start(frame))
         finish_chunk = spec.remote is not None and spec.remote.mode == "async"
-        rest = np.empty((0, ACTION_DIM), np.float32)  # actions of the old chunk still to be made while a call is answered
+        rest = np.empty((0, self.spec.action.dimension), np.float32)  # actions of the old chunk still to be made while a call is answered
         if isinstance(driver.caller, Privileged):
             driver.caller.bind(self.env)
         driver.caller.reset(self.instance.instruction, seed)
         while not self.env.done:
             call = driver.caller.call(self.env.observe(spec.cameras, spec.image_size))
             self._count(call)
-            made = self._wait(delay_steps(call, spec.is_remote), rest if finish_chunk else rest[:0])
+            made = self._wait(delay_steps(call, spec.is_remote, self.spec.control_hz), rest if finish_chunk else rest[:0])
             if call.actions is None:
                 return call.failure
             stop = max(made, spec.execute)
-            for action in call.actions[made:stop]:
-                if not self.env.done:
-                    self._step(action)
+            self._make(call.actions[made:stop])
             rest = call.actions[stop:]
         return None
 
@@ -196,7 +196,7 @@ class _Episode:
             success=bool(self.env.success),
             subgoals=float(self.env.subgoal_fraction),
             steps=int(self.env.steps),
-            seconds=Seconds(self.upload, self.inference, self.download, self.env.steps / CONTROL_HZ),
+            seconds=Seconds(self.upload, self.inference, self.download, self.env.steps / self.spec.control_hz),
             calls=own.calls if own else 0,
             actions=own.actions if own else 0,
             price=sum((tally.price for tally in self.tallies), 0.0),
@@ -214,23 +214,37 @@ class _Episode:
 
     def _wait(self, steps: int, rest: Actions) -> int:
         """Let `steps` control steps pass, making the actions of `rest` as far as they go. Returns how many of them were made."""
-        made = 0
-        for _ in range(steps):
-            if self.env.done:
-                break
-            if made < len(rest):
-                self._step(rest[made])
-                made += 1
-            else:
-                self._step(None)
+        made = self._make(rest[:steps])
+        self._hold(steps - made)
         return made
 
-    def _step(self, action: "Actions | None") -> None:
-        """One control step with an action of the policy, or holding still."""
-        self.env.advance(self.env.hold_action() if action is None else self.noise(action))
-        if action is not None:
+    def _make(self, actions: Actions) -> int:
+        """Make the actions (T, D) of the policy until the episode is over. Returns how many were made."""
+        if self.chunked is not None and len(actions) > 1 and not self.env.done:
+            made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions]))
+            self.tallies[-1].actions += made
+            return made
+        for made, action in enumerate(actions):
+            if self.env.done:
+                return made
+            self.env.advance(self.noise(action))
             self.tallies[-1].actions += 1
-        frame = self._frame(waiting=action is None)
+            self._stepped(waiting=False)
+        return len(actions)
+
+    def _hold(self, steps: int) -> None:
+        """Hold still for so many control steps, or until the episode is over."""
+        if self.chunked is not None and steps > 1 and not self.env.done:
+            self.chunked.advance_chunk(np.stack([self.env.hold_action()] * steps))
+            return
+        for _ in range(steps):
+            if self.env.done:
+                return
+            self.env.advance(self.env.hold_action())
+            self._stepped(waiting=True)
+
+    def _stepped(self, waiting: bool) -> None:
+        frame = self._frame(waiting)
         self._tell(lambda subscriber: subscriber.on_step(frame))
 
     def _tell(self, message: Callable[[Subscriber], None]) -> None:

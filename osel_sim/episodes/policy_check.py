@@ -13,13 +13,13 @@ from osel_sim.core.files import finite, write_json
 from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
 from osel_sim.formats import library
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.call import Call, Caller, Privileged
+from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.outcome import Outcome
-from osel_sim.interface.policy import ACTION_DIM, Observation
-from osel_sim.policy.mapping import state_of
+from osel_sim.interface.policy import Observation
+from osel_sim.interface.suite import Task
+from osel_sim.policy.mapping import state_of, wanted_parts
 
-AXES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
 OTHER_INSTRUCTION = "leave everything as it is"
 SATURATED, STILL, TINY, FAR = 0.999, 1e-4, 0.02, 8.0
 FLAT_IMAGE = 4.0
@@ -117,7 +117,7 @@ def find_policy(policy: str, folder: Path | None) -> tuple[PolicySpec, Path | No
     return load_policy_file(file.resolve()), file.resolve().parent
 
 
-def check_policy(spec: PolicySpec, task: TaskSpec, seed: int, level: int, out: Path, policies: Path | None = None) -> Report:
+def check_policy(spec: PolicySpec, task: Task, seed: int, level: int, out: Path, policies: Path | None = None) -> Report:
     """Let a policy act on one test instance, without its fallback, and look at everything that went in and out.
 
     Args:
@@ -128,14 +128,12 @@ def check_policy(spec: PolicySpec, task: TaskSpec, seed: int, level: int, out: P
         OselError: the policy does not load, its file is wrong, or its server cannot be reached.
     """
     from osel_sim.episodes.drivers import Drivers
-    from osel_sim.sim.env import TaskEnv
-    from osel_sim.sim.instance import make_instance
 
-    instance = make_instance(task, seed, level, "test")
+    instance, environment = task.instance(seed, level), task.specification
     report = Report(spec.name, instance.key, instance.instruction)
-    with Drivers([spec]) as drivers:
+    with Drivers([spec], environment) as drivers:
         watched = Watched(drivers[spec.name].caller)
-        env = TaskEnv(task)
+        env = task.open()
         try:
             env.load(instance)
             other = _OtherInstruction(drivers[spec.name])
@@ -146,15 +144,15 @@ def check_policy(spec: PolicySpec, task: TaskSpec, seed: int, level: int, out: P
     report.calls = len(watched.seen)
     report.outcome = asdict(outcome)
     if watched.seen:
-        _inputs(report, spec, watched.seen[0][0])
+        _inputs(report, spec, environment, watched.seen[0][0])
         report.pictures = _pictures(spec, [observation for observation, _ in watched.seen], out)
-    _actions(report, [call.actions for _, call in watched.seen if call.actions is not None], other.answer)
+    _actions(report, environment.action, [call.actions for _, call in watched.seen if call.actions is not None], other.answer)
     _end(report, outcome)
     write_json(out / "report.json", finite(asdict(report)))
     return report
 
 
-def _inputs(report: Report, spec: PolicySpec, first: Observation) -> None:
+def _inputs(report: Report, spec: PolicySpec, environment: EnvironmentSpec, first: Observation) -> None:
     for camera in spec.cameras:
         image: NDArray[np.uint8] = first[f"observation.images.{camera}"]
         size = " x ".join(map(str, image.shape[:2]))
@@ -163,9 +161,9 @@ def _inputs(report: Report, spec: PolicySpec, first: Observation) -> None:
             report.findings.append((PROBLEM, f"the image of {camera} is of one colour"))
     for key in spec.mapping.blank:
         report.inputs[key] = "black"
-    if spec.mapping.state:
-        state = state_of(first, spec.mapping)
-        report.inputs[spec.mapping.state] = f"{', '.join(spec.mapping.state_parts)}: {np.array2string(state, precision=3, suppress_small=True)}"
+    if spec.mapping.state and environment.state:
+        state, parts = state_of(first, spec.mapping, environment), ", ".join(wanted_parts(spec.mapping, environment))
+        report.inputs[spec.mapping.state] = f"{parts}: {np.array2string(state, precision=3, suppress_small=True)}"
         report.findings += [(NOTE, text) for text in _far_off(spec, state)]
     report.inputs[spec.mapping.prompt] = repr(report.instruction)
 
@@ -202,14 +200,15 @@ def _pictures(spec: PolicySpec, observations: list[Observation], out: Path) -> l
     return files
 
 
-def _actions(report: Report, chunks: list[NDArray[np.float32]], other: Call | None) -> None:
+def _actions(report: Report, spec: ActionSpec, chunks: list[NDArray[np.float32]], other: Call | None) -> None:
     if not chunks:
         return
     lengths = [len(chunk) for chunk in chunks]
     report.chunk = (min(lengths), max(lengths))
     actions = np.concatenate(chunks)
-    limit = np.abs(actions) >= SATURATED
-    for index, axis in enumerate(AXES[:ACTION_DIM]):
+    scaled = (actions - spec.middle) / spec.half_range
+    limit = np.abs(scaled) >= SATURATED
+    for index, axis in enumerate(spec.names):
         column = actions[:, index]
         report.actions[axis] = {
             "min": float(column.min()),
@@ -218,17 +217,19 @@ def _actions(report: Report, chunks: list[NDArray[np.float32]], other: Call | No
             "std": float(column.std()),
             "at_limit": float(limit[:, index].mean()),
         }
-    motions, found = actions[:, :6], report.findings
-    if (motions.std(axis=0) < STILL).all():
+    moves, found = spec.moves, report.findings
+    if len(chunks) > 1 and (scaled[:, spec.motions].std(axis=0) < STILL).all():
         found.append((PROBLEM, "all its motions are the same from beginning to end: it does not react to what it sees"))
-    elif (np.abs(motions[:, :3]) < TINY).all():
-        found.append((PROBLEM, f"its motions are all below {TINY}: are they metres a step? then [mapping] scale = [20, 20, 20, 2, 2, 2]"))
-    if limit[:, :3].mean() > 0.7:
+    elif moves and (np.abs(scaled[:, moves]) < TINY).all():
+        hint = ": are they metres a step? then [mapping] scale = [20, 20, 20, 2, 2, 2]" if spec.turns else " of half their range"
+        found.append((PROBLEM, f"its motions are all below {TINY}{hint}"))
+    if moves and limit[:, moves].mean() > 0.7:
         found.append(
-            (PROBLEM, f"{limit[:, :3].mean():.0%} of its motions are at the limit: [mapping] scale or the statistics of its actions are wrong")
+            (PROBLEM, f"{limit[:, moves].mean():.0%} of its motions are at the limit: [mapping] scale or the statistics of its actions are wrong")
         )
-    if (actions[:, 6] > 0).all() or (actions[:, 6] <= 0).all():
-        word = "closed" if actions[0, 6] > 0 else "open"
+    gripper = None if spec.gripper_index is None else actions[:, spec.gripper_index]
+    if gripper is not None and ((gripper > 0).all() or (gripper <= 0).all()):
+        word = "closed" if (gripper[0] > 0) == (spec.gripper_convention == "closed_positive") else "open"
         found.append((NOTE, f"the gripper is told to be {word} from beginning to end; [mapping] gripper says what its number means"))
     if other is not None and other.actions is not None and np.array_equal(other.actions, chunks[0]):
         found.append((PROBLEM, "another instruction about the same scene gives the very same actions: it does not read the instruction"))

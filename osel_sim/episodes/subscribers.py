@@ -1,4 +1,4 @@
-"""Listeners of the episode loop that measure or pace it; the video has a file of its own."""
+"""Subscribers of the episode loop that measure or pace it; the video has a file of its own."""
 
 import time
 from typing import override
@@ -6,7 +6,6 @@ from typing import override
 from osel_sim.episodes.loop import Frame, Subscriber
 from osel_sim.interface.call import Call
 from osel_sim.interface.outcome import Outcome
-from osel_sim.interface.policy import CONTROL_HZ
 
 
 class Timing(Subscriber):
@@ -36,15 +35,16 @@ class Timing(Subscriber):
 
 
 class RealTime(Subscriber):
-    """Sleeps so that control steps happen at 20 Hz, waits included. A machine that cannot keep up simply runs late."""
+    """Sleeps so that control steps happen at the control rate, waits included. A machine that cannot keep up simply runs late."""
 
     def __init__(self) -> None:
-        self._start = time.perf_counter()
+        self._start, self._hz = time.perf_counter(), 0.0
 
     @override
     def on_start(self, frame: Frame) -> None:
-        self._start = time.perf_counter() - frame.steps / CONTROL_HZ
+        self._hz = frame.env.specification.control_hz
+        self._start = time.perf_counter() - frame.steps / self._hz
 
     @override
     def on_step(self, frame: Frame) -> None:
-        time.sleep(max(0.0, self._start + frame.steps / CONTROL_HZ - time.perf_counter()))
+        time.sleep(max(0.0, self._start + frame.steps / self._hz - time.perf_counter()))

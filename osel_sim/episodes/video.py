@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from osel_sim.core.files import atomic
 from osel_sim.episodes.loop import Frame, Subscriber
 from osel_sim.interface.outcome import Outcome
-from osel_sim.interface.policy import CONTROL_HZ
 
 if TYPE_CHECKING:
     from collections.abc import Generator
 
 SIZE = 480  # pixels; the picture is square, the text stands in a band above it
-EVERY = 2  # a frame every second control step: 10 frames a second, in real time
+RATE = 10  # frames a second, as near as control steps allow, in real time
 HOLD_SECONDS = 1  # the last frame stays that long, with the result
 _BAND = 80
 _WHITE, _GREY, _GREEN, _RED, _AMBER = (255, 255, 255), (170, 170, 170), (120, 220, 120), (255, 120, 110), (255, 200, 90)
@@ -28,26 +27,31 @@ class Video(Subscriber):
 
     Args:
         file: where to; its folder is made.
-        camera: which camera to show.
+        camera: which camera to show; None: the environment's context camera.
         quality: of the rendering, `full` or `fast`.
     """
 
-    def __init__(self, file: Path, camera: str = "agentview", quality: str = "full") -> None:
+    def __init__(self, file: Path, camera: str | None = None, quality: str = "full") -> None:
         self.file, self.camera, self.quality = file, camera, quality
         self._file = ExitStack()
         self._writer: Generator[None, NDArray[np.uint8] | None, None] | None = None
         self._last: Frame | None = None
+        self._every, self._fps = 1, float(RATE)
         self._image: NDArray[np.uint8] = np.zeros((SIZE, SIZE, 3), np.uint8)
 
     @override
     def on_start(self, frame: Frame) -> None:
         import imageio_ffmpeg  # type: ignore[import-untyped]
 
+        specification = frame.env.specification
+        self.camera = self.camera or specification.context_camera
+        self._every = max(1, round(specification.control_hz / RATE))
+        self._fps = specification.control_hz / self._every
         self.file.parent.mkdir(parents=True, exist_ok=True)
         self._writer = imageio_ffmpeg.write_frames(
             str(self._file.enter_context(atomic(self.file))),
             (SIZE, SIZE + _BAND),
-            fps=CONTROL_HZ / EVERY,
+            fps=self._fps,
             codec="libx264",
             quality=8,
             macro_block_size=16,
@@ -59,7 +63,7 @@ class Video(Subscriber):
 
     @override
     def on_step(self, frame: Frame) -> None:
-        if frame.steps % EVERY == 0:
+        if frame.steps % self._every == 0:
             self._show(frame)
         else:
             self._last = frame
@@ -69,14 +73,14 @@ class Video(Subscriber):
         if self._writer is None or self._last is None:
             return
         self._show(self._last, outcome)
-        for _ in range(HOLD_SECONDS * CONTROL_HZ // EVERY - 1):
+        for _ in range(int(HOLD_SECONDS * self._fps) - 1):
             self._send(self._image)
         self._writer.close()
         self._file.close()
 
     def _show(self, frame: Frame, outcome: Outcome | None = None) -> None:
         self._last = frame
-        picture = frame.env.image(self.camera, SIZE, SIZE, self.quality)
+        picture = frame.env.image(self.camera or frame.env.specification.context_camera, SIZE, SIZE, self.quality)
         self._image = annotate(picture, frame, outcome)
         self._send(self._image)
 

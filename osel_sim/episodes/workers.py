@@ -14,9 +14,9 @@ from osel_sim.core.errors import WorkerError
 from osel_sim.core.processes import Result, Work, run_jobs
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
-from osel_sim.formats.task_file import TaskSpec
+from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome, Seconds
-from osel_sim.sim.instance import Instance, make_instance
+from osel_sim.interface.suite import Task
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,7 +44,7 @@ class Plan:
         action_noise: as `run_episode` takes it.
     """
 
-    tasks: tuple[TaskSpec, ...]
+    tasks: tuple[Task, ...]
     policies: tuple[PolicySpec, ...]
     everyone: tuple[PolicySpec, ...]
     seeds: range
@@ -59,7 +59,7 @@ class Plan:
     @functools.cached_property
     def instances(self) -> dict[str, Instance]:
         """Key -> instance, in the order of rows: task by task, seed by seed."""
-        drawn = (make_instance(task, seed, self.levels[seed % len(self.levels)], self.split, self.axes) for task in self.tasks for seed in self.seeds)
+        drawn = (task.instance(seed, self.levels[seed % len(self.levels)], self.split, self.axes) for task in self.tasks for seed in self.seeds)
         return {instance.key: instance for instance in drawn}
 
     def episodes(self, instance: str) -> list[Episode]:
@@ -127,22 +127,23 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
     from osel_sim.context.encoder import load_encoder
     from osel_sim.episodes.drivers import Drivers
     from osel_sim.episodes.loop import run_episode
+    from osel_sim.episodes.start import Start
     from osel_sim.episodes.view import view
-    from osel_sim.sim.task_envs import TaskEnvs
+    from osel_sim.suites.open_tasks import OpenTasks
+    from osel_sim.suites.registry import common_specification
 
     torch.set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
-    encoder, drivers = load_encoder(plan.encoder), Drivers(plan.everyone)
-    envs = TaskEnvs(plan.tasks, keep=2)  # work comes task by task
+    encoder, drivers = load_encoder(plan.encoder), Drivers(plan.everyone, common_specification(plan.tasks))
+    envs = OpenTasks(plan.tasks, keep=2)  # work comes task by task
 
     def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | Row]":
         instance = plan.instances[job.instance]
         env = envs[instance.task]
-        env.load(instance)
-        begin = env.snapshot()
+        begin = Start(env, instance)
         if start == 0:
             yield encoder.encode(view(env, encoder), instance.instruction)
         for policy, repeat in job.episodes[max(0, start - 1) :]:
-            env.restore(begin)
+            begin.again()
             outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat, action_noise=plan.action_noise)
             yield make_row(instance, policy, repeat, outcome)
 

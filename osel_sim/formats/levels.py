@@ -6,6 +6,7 @@ Also the key of an instance, which says all that fixes it.
 from collections.abc import Iterable, Mapping
 
 from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.interface.instance import label as label
 from osel_sim.interface.robot import DEFAULT_ROBOT
 
 LEVELS = (0, 1, 2, 3)
@@ -13,22 +14,25 @@ AXES = ("light", "camera", "texture", "distractors", "colours", "sizes", "start"
 """Lamp, camera poses, table top, more objects, tint of things, size of objects, wider start regions, robot's start pose, held-out phrasings."""
 
 
-def parse_axes(items: Iterable[str]) -> dict[str, int]:
+def parse_axes(items: Iterable[str], known: Iterable[str] = AXES) -> dict[str, int]:
     """`["camera=2", "light=1"]`, as given on a command line -> {"camera": 2, "light": 1}.
+
+    Args:
+        known: names of axes; those of our own tasks by default.
 
     Raises:
         UsageError: naming the item and what would be right.
     """
-    result: dict[str, int] = {}
+    known, result = tuple(known), dict[str, int]()
     for item in items:
         axis, equals, number = item.partition("=")
         if not equals or not number.isdecimal():
-            raise UsageError(f"--axis {item!r} must read AXIS=LEVEL, such as camera=2; axes: {', '.join(AXES)}; levels: {_known(LEVELS)}")
+            raise UsageError(f"--axis {item!r} must read AXIS=LEVEL, such as camera=2; axes: {', '.join(known)}; levels: {_known(LEVELS)}")
         if result.get(axis, int(number)) != int(number):
             raise UsageError(f"--axis {axis} is given twice, with levels {result[axis]} and {int(number)}")
         result[axis] = int(number)
     for axis, level in result.items():
-        _check(axis, level)
+        _check(axis, level, known)
     return result
 
 
@@ -62,11 +66,6 @@ def split_off(levels: Mapping[str, int]) -> tuple[int, str | None]:
     return level, above or None
 
 
-def label(level: int, axes: str | None) -> str:
-    """`2`, `camera=2,light=1` or `1,camera=3`: the part of an instance's key that says how it is perturbed."""
-    return str(level) if axes is None else axes if level == 0 else f"{level},{axes}"
-
-
 def instance_key(task: str, split: str, perturbed: str, seed: int, robot: str | None = None) -> str:
     """`pick_place/test/2/7`, or `pick_place/test/2/7-UR5e` for another robot than the usual one.
 
@@ -77,9 +76,9 @@ def instance_key(task: str, split: str, perturbed: str, seed: int, robot: str | 
     return f"{task}/{split}/{perturbed}/{seed}" + ("" if robot in (None, DEFAULT_ROBOT) else f"-{robot}")
 
 
-def _check(axis: str, level: int) -> None:
-    if axis not in AXES:
-        raise UnknownNameError("axis", axis, AXES)
+def _check(axis: str, level: int, known: Iterable[str] = AXES) -> None:
+    if axis not in known:
+        raise UnknownNameError("axis", axis, known)
     if level not in LEVELS:
         raise UsageError(f"axis {axis!r}: unknown level {level}, known: {_known(LEVELS)}")
 

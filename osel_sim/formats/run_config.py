@@ -11,14 +11,14 @@ import platform
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
 from osel_sim.core.files import digest, is_partial, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.interface.suite import Task
 
 SCHEMA_VERSION = 1
 RUN = "run.json"
@@ -27,15 +27,16 @@ UNSAID = ("robot",)
 LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
 
 
-def environment(gl: str, root: Path) -> dict[str, Any]:
+def environment(gl: str, root: Path, packages: Iterable[str] = ()) -> dict[str, Any]:
     """What a run ran with.
 
     Args:
         gl: the OpenGL backend in use.
         root: folder whose git revision counts.
+        packages: more distributions whose versions count, besides those that every run needs.
     """
     versions = {"python": platform.python_version()}
-    for name in LIBRARIES:
+    for name in (*LIBRARIES, *packages):
         try:
             versions[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
@@ -56,9 +57,9 @@ def git_revision(root: Path) -> str | None:
         return None
 
 
-def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -> dict[str, str]:
+def content_digests(tasks: Iterable[Task], policies: Iterable[PolicySpec]) -> dict[str, str]:
     """What the files that a run depends on hold: the tasks', the policies', and their checkpoints' where those lie on this machine."""
-    digests = {f"task {task.name}": digest(task.file) for task in tasks}
+    digests = {f"task {task.name}": task.info.digest for task in tasks}
     for spec in policies:
         # A Python object has no file; its class is all that can be said of it.
         digests[f"policy {spec.name}"] = digest(spec.file) if spec.file.is_file() else str(spec.file)
@@ -68,11 +69,25 @@ def content_digests(tasks: Iterable[TaskSpec], policies: Iterable[PolicySpec]) -
     return digests
 
 
-def robots_said(tasks: Iterable[TaskSpec]) -> dict[str, Any]:
+class HasRobot(Protocol):
+    """A task, and who does it."""
+
+    @property
+    def name(self) -> str:
+        """Name of the task."""
+        ...
+
+    @property
+    def robot(self) -> str:
+        """Name of the robot; empty where the suite has but one."""
+        ...
+
+
+def robots_said(tasks: Iterable[HasRobot]) -> dict[str, Any]:
     """`robot` of a configuration: the one that does all tasks, or the robot of each; nothing where that is the usual one."""
     robots = {task.name: task.robot for task in tasks}
     names = set(robots.values())
-    return {"robot": robots if len(names) > 1 else names.pop()} if names != {DEFAULT_ROBOT} else {}
+    return {"robot": robots if len(names) > 1 else names.pop()} if names - {DEFAULT_ROBOT, ""} else {}
 
 
 def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) -> None:

@@ -1,70 +1,20 @@
-"""A task file: scene, language, goal, subgoals and the expert's plan of one task family."""
+"""A task: scene, language, goal, subgoals and the expert's plan of one task family, as code wants them."""
 
-import string
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from osel_sim.core.errors import ContentError
+from osel_sim.formats.catalogue import Catalogue, Entity, load_catalogue
 from osel_sim.formats.levels import AXES
-from osel_sim.formats.terms import KINDS, PREDICATES, SKILLS, Term, parse_term
-from osel_sim.formats.validate import Table
+from osel_sim.formats.task_schema import Region, Sorting, TaskFile
+from osel_sim.formats.terms import ATTRIBUTE, KINDS, Term
+from osel_sim.formats.toml_file import load_toml
 from osel_sim.interface.robot import DEFAULT_ROBOT
-
-if TYPE_CHECKING:
-    from osel_sim.formats.catalogue import Catalogue
-
-ARENAS = ("table",)
-ATTRIBUTE = "attribute"
-"""Kind of a role that names a property (a rule such as "the red things") instead of a thing."""
-
-
-@dataclass(frozen=True)
-class Region:
-    """Where things of one kind start: ranges in metres on the table and radians."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-    yaw: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class Entity:
-    """A thing of the catalogue that takes part in a task (assets/objects/objects.toml explains the fields)."""
-
-    name: str
-    kind: str
-    names: tuple[str, ...]
-    model: str
-    radius: float
-    size: tuple[float, ...] = ()
-    rgba: tuple[float, ...] = ()
-    grasp: float = 0.0
-    inner: float = 0.0
-    rim: float = 0.0
-    floor: float = 0.0
-    symmetry: int = 180
-    handle: str = ""
-    inside: str = ""
-    lean: float = 0.0
-    joint: str = ""
-    attributes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Sorting:
-    """A role filled by a rule: with `then` if the thing of role `thing` has the attribute of role `attribute`, else with `otherwise`."""
-
-    thing: str
-    attribute: str
-    then: str
-    otherwise: str
 
 
 @dataclass(frozen=True)
 class TaskSpec:
-    """One task file, validated.
+    """One task file as code wants it: things and properties are those of the catalogue, roles told apart by how they are filled.
 
     Attributes:
         horizon: control steps (20 Hz) after which an episode ends.
@@ -116,7 +66,7 @@ class TaskSpec:
         return tuple(entity for entity in self.entities if entity.kind == kind)
 
 
-def load_task_file(file: Path, catalogue: "Catalogue | None" = None) -> TaskSpec:
+def load_task_file(file: Path, catalogue: Catalogue | None = None) -> TaskSpec:
     """Read and check a task file.
 
     Args:
@@ -125,128 +75,35 @@ def load_task_file(file: Path, catalogue: "Catalogue | None" = None) -> TaskSpec
     Raises:
         ContentError: naming the file, the key and what would be right.
     """
-    from osel_sim.formats.catalogue import load_catalogue
-
     catalogue = load_catalogue() if catalogue is None else catalogue
-    table = Table.load(file)
-    version = table.integer("version", 1, 1)
-    name = table.get("name", str)
-    if name != file.stem:
-        raise ContentError(file, "name", f"must equal the file's name {file.stem!r}, got {name!r}")
-    scene = table.table("scene")
-    entities = _entities(scene, catalogue)
-    distractors = scene.interval("distractors", [0, 0])
-    kinds_used = [kind for kind in KINDS if any(entity.kind == kind for entity in entities)]
-    regions = scene.table("region")
-    region_of = {kind: _region(regions.table(kind)) for kind in kinds_used}
-    regions.done()
-    starts = scene.table("start", {})
-    start_of = {kind: starts.interval(kind, [0.0, 0.0]) for kind in kinds_used if any(e.joint for e in entities if e.kind == kind)}
-    starts.done()
+    return _spec(load_toml(TaskFile, file, {"catalogue": catalogue}), file, catalogue)
 
-    role_table, unnamed_table = table.table("roles"), table.table("unnamed", {})
-    roles = {role: role_table.choice(role, (*KINDS, ATTRIBUTE)) for role in role_table.data}
-    if not roles:
-        raise table.error("roles", "needs at least one role")
-    unnamed, sorted_roles = _unnamed(unnamed_table, roles)
-    filled = [*roles.values(), *unnamed.values()]
-    for kind in set(filled) - {ATTRIBUTE}:
-        wanted = filled.count(kind) + (int(distractors[1]) if kind == "object" else 0)
-        if (there := sum(entity.kind == kind for entity in entities)) < wanted:
-            raise scene.error(kind + "s", f"has {there} {kind}s, the roles and distractors need {wanted}")
-    language = table.table("language")
-    phrasings = {key: language.strings(key) for key in ("train", "held_out")}
-    for key, templates in phrasings.items():
-        _check_phrasings(language, key, templates, set(roles))
-    if shared := set(phrasings["train"]) & set(phrasings["held_out"]):
-        raise language.error("held_out", f"repeats a training phrasing: {sorted(shared)[0]!r}")
 
-    goal, subgoals, expert = table.table("goal"), table.table("subgoals"), table.table("expert")
-    kinds = {**roles, **unnamed, **{role: roles[rule.then] for role, rule in sorted_roles.items()}}
-    spec = TaskSpec(
-        name=name,
-        title=table.get("title", str),
-        version=version,
-        tags=table.strings("tags", []),
-        horizon=table.integer("horizon", 1, 100_000),
-        arena=scene.choice("arena", ARENAS),
+def _spec(task: TaskFile, file: Path, catalogue: Catalogue) -> TaskSpec:
+    """The task as code wants it."""
+    entities = task.scene.entities(catalogue)
+    moving = [kind for kind in KINDS if any(entity.joint for entity in entities if entity.kind == kind)]
+    return TaskSpec(
+        name=task.name,
+        title=task.title,
+        version=task.version,
+        tags=task.tags,
+        horizon=task.horizon,
+        arena=task.scene.arena,
         entities=entities,
-        distractors=(int(distractors[0]), int(distractors[1])),
-        regions=region_of,
-        starts=start_of,
-        roles=roles,
-        unnamed=unnamed,
-        sorted_roles=sorted_roles,
-        attributes=catalogue.attributes if ATTRIBUTE in roles.values() else {},
-        train=phrasings["train"],
-        held_out=phrasings["held_out"],
-        goal=tuple(parse_term(goal, "all", text, PREDICATES, kinds) for text in goal.strings("all")),
-        subgoals=tuple((key, parse_term(subgoals, key, subgoals.get(key, str), PREDICATES, kinds)) for key in subgoals.data),
-        plan=tuple(parse_term(expert, "plan", text, SKILLS, kinds) for text in expert.strings("plan")),
+        distractors=task.scene.distractors,
+        regions={kind: task.scene.region[kind] for kind in KINDS if kind in task.scene.region},
+        starts={kind: task.scene.start.get(kind, (0.0, 0.0)) for kind in moving},
+        roles=task.roles,
+        unnamed={role: kind for role, kind in task.unnamed.items() if not isinstance(kind, Sorting)},
+        sorted_roles={role: rule for role, rule in task.unnamed.items() if isinstance(rule, Sorting)},
+        attributes=catalogue.attributes if ATTRIBUTE in task.roles.values() else {},
+        train=task.language.train,
+        held_out=task.language.held_out,
+        goal=task.goal.all,
+        subgoals=tuple(task.subgoals.items()),
+        plan=task.expert.plan,
         file=file,
-        axes=_axes(scene),
-        robot=table.get("robot", str, DEFAULT_ROBOT),
+        axes=task.scene.axes,
+        robot=task.robot,
     )
-    for section in (table, scene, language, goal, expert):
-        section.done()
-    return spec
-
-
-def _entities(scene: Table, catalogue: "Catalogue") -> tuple[Entity, ...]:
-    entities: list[Entity] = []
-    for kind in KINDS:
-        known = [entity.name for entity in catalogue.things.values() if entity.kind == kind]
-        for item in scene.strings(kind + "s", []):
-            scene.one_of(kind + "s", item, known)
-            entities.append(catalogue.things[item])
-    if not entities:
-        raise scene.error("objects", f"the scene is empty; it takes {', '.join(kind + 's' for kind in KINDS)}")
-    return tuple(entities)
-
-
-def _unnamed(table: Table, roles: Mapping[str, str]) -> tuple[dict[str, str], dict[str, Sorting]]:
-    """Roles that no instruction names: kinds, and roles filled by a rule."""
-    unnamed: dict[str, str] = {}
-    rules: dict[str, Sorting] = {}
-    for role, value in table.data.items():
-        if role in roles:
-            raise table.error(role, "is a role already")
-        if isinstance(value, dict):
-            rule = table.table(role)
-            named = {kind: [name for name, other in roles.items() if (other == ATTRIBUTE) == (kind == ATTRIBUTE)] for kind in (ATTRIBUTE, "thing")}
-            rules[role] = Sorting(
-                rule.choice("thing", tuple(unnamed)),
-                rule.choice("attribute", tuple(named[ATTRIBUTE])),
-                rule.choice("then", tuple(named["thing"])),
-                rule.choice("otherwise", tuple(named["thing"])),
-            )
-            rule.done()
-        else:
-            unnamed[role] = table.choice(role, KINDS)
-    return unnamed, rules
-
-
-def _axes(scene: Table) -> tuple[str, ...]:
-    axes = scene.strings("axes", list(AXES))
-    for axis in axes:
-        scene.one_of("axes", axis, AXES)
-    return axes
-
-
-def _region(table: Table) -> Region:
-    region = Region(table.interval("x"), table.interval("y"), table.interval("yaw", [0.0, 0.0]))
-    table.done()
-    return region
-
-
-def _check_phrasings(table: Table, key: str, templates: tuple[str, ...], roles: set[str]) -> None:
-    if not templates:
-        raise table.error(key, "needs at least one phrasing")
-    for template in templates:
-        try:
-            fields = {field for _, field, _, _ in string.Formatter().parse(template) if field is not None}
-        except ValueError as error:
-            raise table.error(key, f"{template!r}: {error}") from None
-        if fields != roles:
-            wanted = ", ".join(f"{{{role}}}" for role in sorted(roles))
-            raise table.error(key, f"{template!r} must name {wanted} and nothing else, so that it can only be followed by reading it")

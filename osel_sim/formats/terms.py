@@ -2,19 +2,24 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
+
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
 
 from osel_sim.core.registry import Registry
-from osel_sim.formats.validate import Table
+from osel_sim.formats.toml_types import quoted, unknown_value
 from osel_sim.interface.terms import Predicate, Signature, Skill
 
 KINDS = ("object", "container", "zone", "peg", "drawer", "button", "door")
 """Kinds of things. Objects lie loose; all others stand fast, some with a part that moves."""
+ATTRIBUTE = "attribute"
+"""Kind of a role that names a property (a rule such as "the red things") instead of a thing."""
 RECEPTACLES = ("container", "zone", "peg", "drawer")
 """Kinds that objects can be put into, onto or around."""
 HINGED = ("drawer", "door")
 """Kinds that open and close."""
-ARTICULATED = (*HINGED, "button")
-"""Kinds with a part that moves."""
 
 
 class Signatures(Mapping[str, Signature]):
@@ -59,27 +64,39 @@ class Term:
     def __str__(self) -> str:
         return f"{self.name}({', '.join(self.roles)})"
 
+    def faults(self, known: Mapping[str, Signature], roles: Mapping[str, str]) -> Iterator[str]:
+        """What makes no sense about it: roles that there are not, or things of the wrong kind.
 
-def parse_term(table: Table, key: str, text: str, known: Mapping[str, Signature], roles: Mapping[str, str]) -> Term:
-    """Read one term.
+        Args:
+            known: `PREDICATES` or `SKILLS`.
+            roles: role -> kind of thing that fills it.
+        """
+        for role, kinds in zip(self.roles, known[self.name], strict=True):
+            if role not in roles:
+                yield f"{quoted(str(self))}: {unknown_value(role, roles)}"
+            elif roles[role] not in kinds:
+                yield f"{quoted(str(self))}: {role!r} is of kind {roles[role]!r}, {self.name} wants one of {', '.join(kinds)}"
 
-    Args:
-        table, key: where it stands, for complaints.
-        known: `PREDICATES` or `SKILLS`.
-        roles: role -> kind of thing that fills it.
 
-    Raises:
-        ContentError: not of that form, an unknown name or role, or a thing of a kind that makes no sense there.
-    """
-    name, bracket, rest = (part.strip() for part in text.partition("("))
-    if not bracket or not rest.endswith(")"):
-        raise table.error(key, f"{text!r} must read name(role, ...)")
-    table.one_of(key, name, list(known))
-    arguments = tuple(part.strip() for part in rest[:-1].split(","))
-    if len(arguments) != len(known[name]):
-        raise table.error(key, f"{text!r}: {name} takes {len(known[name])} role(s), got {len(arguments)}")
-    for role, kinds in zip(arguments, known[name], strict=True):
-        table.one_of(key, role, list(roles))
-        if roles[role] not in kinds:
-            raise table.error(key, f"{text!r}: {role!r} is of kind {roles[role]!r}, {name} wants one of {', '.join(kinds)}")
-    return Term(name, arguments)
+@dataclass(frozen=True)
+class TermOf:
+    """Annotates a `Term` that a TOML file gives as text, of `known` predicates or skills."""
+
+    known: Mapping[str, Signature]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._parse, core_schema.str_schema())
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        return {**handler(schema), "pattern": r"^\s*\w+\s*\([^()]*\)\s*$"}  # which names there are, packages may add to
+
+    def _parse(self, text: str) -> Term:
+        name, bracket, rest = (part.strip() for part in text.partition("("))
+        if not bracket or not rest.endswith(")"):
+            raise ValueError(f"{quoted(text)} must read name(role, ...)")
+        if name not in self.known:
+            raise ValueError(f"{quoted(text)}: {unknown_value(name, self.known)}")
+        roles = tuple(part.strip() for part in rest[:-1].split(","))
+        if len(roles) != len(self.known[name]):
+            raise ValueError(f"{quoted(text)}: {name} takes {len(self.known[name])} role(s), got {len(roles)}")
+        return Term(name, roles)

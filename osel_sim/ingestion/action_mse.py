@@ -21,7 +21,8 @@ from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.ingestion.write import IngestedInstance
 from osel_sim.interface.encoder import Image
-from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
+from osel_sim.interface.policy import Observation
+from osel_sim.sim.specification import ACTION_DIM, STATE_DIM, specification
 
 IMAGES = "observation.images."
 STATE, ACTION = "observation.state", "action"
@@ -158,7 +159,7 @@ def measure_errors(samples: Sequence[Sample], specs: Sequence[PolicySpec], setti
     from osel_sim.episodes.drivers import Drivers
 
     rows = []
-    with Drivers(specs) as drivers, progress(len(samples), "frame") as bar:
+    with Drivers(specs, specification()) as drivers, progress(len(samples), "frame") as bar:
         for sample in samples:
             observation = sample.dataset.observation(sample.frame)
             rows += [measure_one(sample, drivers[spec.name], observation, settings.tolerance) for spec in specs]
@@ -171,7 +172,7 @@ def measure_errors(samples: Sequence[Sample], specs: Sequence[PolicySpec], setti
 
 
 def action_mse(actions: NDArray[np.float32], logged: NDArray[np.float32]) -> float:
-    """Mean squared error (T, 7) over the steps that both have, float64 throughout."""
+    """Mean squared error of actions (T, D) over the steps that both have, float64 throughout."""
     steps = min(len(actions), len(logged))
     return float(np.mean(np.square(actions[:steps].astype(np.float64) - logged[:steps])))
 

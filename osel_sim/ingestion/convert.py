@@ -8,7 +8,7 @@ from typing import Any
 
 from osel_sim.core.errors import DataError, UnknownNameError
 from osel_sim.formats.rollout_log import Row
-from osel_sim.ingestion.mapping import Mapping, PolicyColumns, Success, Term, fill, threshold
+from osel_sim.ingestion.columns import Columns, PolicyColumns, Success, Term, fill, threshold
 from osel_sim.ingestion.readers import Record, number, text
 
 _TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0")
@@ -39,7 +39,7 @@ class Converted:
     Attributes:
         rows: in the order instance, policy, repeat.
         sources: an entry for each instance, in the order of the table.
-        policies: names in the log, in the order of the mapping or of their appearance.
+        policies: names in the log, in the order in which they are named, or of their appearance.
         dropped: rows that were left out as duplicates.
         differing: those of them that say something else than the row that was kept.
     """
@@ -51,48 +51,48 @@ class Converted:
     differing: int
 
 
-def convert(mapping: Mapping, records: Sequence[Record]) -> Converted:
+def convert(columns: Columns, records: Sequence[Record]) -> Converted:
     """The outcomes that a table holds.
 
     An empty cell of success means that the policy did not run on the instance: no row comes of it.
 
     Raises:
-        DataError: a cell, row or policy that is not as the mapping says; names file, row and column.
+        DataError: a cell, row or policy that is not as `columns` says; names file, row and column.
     """
     sources: dict[str, Source] = {}
     outcomes: dict[tuple[str, str, int], tuple[Row, Record]] = {}
     keys: dict[tuple[Any, ...], str] = {}
     counters: dict[str, int] = {}
-    names = {policy.name: None for policy in mapping.policies.values()}
+    names = {policy.name: None for policy in columns.policies.values()}
     dropped = differing = 0
     for record in records:
-        source, known = _source(mapping, record, sources, keys, counters)
-        if mapping.policy is None:
-            if known and mapping.repeat is None and mapping.duplicates in ("refuse", "drop"):
-                if mapping.duplicates == "refuse":
-                    raise _duplicate(mapping, record, sources[source.key].record, f"instance {source.key!r}")
+        source, known = _source(columns, record, sources, keys, counters)
+        if columns.policy is None:
+            if known and columns.repeat is None and columns.duplicates in ("refuse", "drop"):
+                if columns.duplicates == "refuse":
+                    raise _duplicate(columns, record, sources[source.key].record, f"instance {source.key!r}")
                 dropped += 1
-                kept = [outcomes.get((source.key, policy.name, 0)) for policy in mapping.policies.values()]
-                again = [_row(mapping, record, source, policy, 0) for policy in mapping.policies.values()]
+                kept = [outcomes.get((source.key, policy.name, 0)) for policy in columns.policies.values()]
+                again = [_row(columns, record, source, policy, 0) for policy in columns.policies.values()]
                 differing += again != [pair and pair[0] for pair in kept]
                 continue
-            policies = list(mapping.policies.values())
+            policies = list(columns.policies.values())
         else:
-            policies = [_policy(mapping, record, names)]
+            policies = [_policy(columns, record, names)]
             names.setdefault(policies[0].name)
         sources.setdefault(source.key, source)
-        repeat = _repeat(mapping, record)
+        repeat = _repeat(columns, record)
         for policy in policies:
-            row = _row(mapping, record, source, policy, repeat or 0)
+            row = _row(columns, record, source, policy, repeat or 0)
             if row is None:
                 continue
             place = (source.key, policy.name, row.repeat)
-            if place in outcomes and mapping.repeat is None and mapping.duplicates == "repeats":
+            if place in outcomes and columns.repeat is None and columns.duplicates == "repeats":
                 place = (*place[:2], next(count for count in range(1, len(records)) if (*place[:2], count) not in outcomes))
                 row = Row(**{**vars(row), "repeat": place[2]})
             if place in outcomes:
-                if mapping.duplicates != "drop":
-                    raise _duplicate(mapping, record, outcomes[place][1], f"instance {source.key!r}, policy {policy.name!r}, repeat {row.repeat}")
+                if columns.duplicates != "drop":
+                    raise _duplicate(columns, record, outcomes[place][1], f"instance {source.key!r}, policy {policy.name!r}, repeat {row.repeat}")
                 dropped += 1
                 differing += row != outcomes[place][0]
                 continue
@@ -109,61 +109,61 @@ def convert(mapping: Mapping, records: Sequence[Record]) -> Converted:
 
 
 def _source(
-    mapping: Mapping, record: Record, sources: dict[str, Source], keys: dict[tuple[Any, ...], str], counters: dict[str, int]
+    columns: Columns, record: Record, sources: dict[str, Source], keys: dict[tuple[Any, ...], str], counters: dict[str, int]
 ) -> tuple[Source, bool]:
     """The instance of a row, and whether an earlier row had it."""
-    task = text(record, mapping.group) if mapping.group else mapping.name
-    words = fill(mapping.text, lambda column: text(record, column))
-    images = tuple(record.file.parent / text(record, column) for column in mapping.images)
-    identity = (task, text(record, mapping.key)) if mapping.key else (task, words, images)
+    task = text(record, columns.group) if columns.group else columns.name
+    words = fill(columns.text, lambda column: text(record, column))
+    images = tuple(record.file.parent / text(record, column) for column in columns.images)
+    identity = (task, text(record, columns.key)) if columns.key else (task, words, images)
     known = identity in keys
-    if known and not (mapping.duplicates == "keep" and mapping.policy is None):
+    if known and not (columns.duplicates == "keep" and columns.policy is None):
         first = sources[keys[identity]]
         if (first.text, first.images) != (words, images):
             raise DataError(
                 f"{record.where}: instance {first.key!r} has another text or image here than in row {first.record.number} of {first.record.file}"
             )
         return first, True
-    if known and mapping.key:
-        raise _duplicate(mapping, record, sources[keys[identity]].record, f"instance {keys[identity]!r}")
+    if known and columns.key:
+        raise _duplicate(columns, record, sources[keys[identity]].record, f"instance {keys[identity]!r}")
     counters[task] = counters.get(task, 0) + 1
-    key = f"{task}/{identity[1] if mapping.key else format(counters[task], '06d')}"
+    key = f"{task}/{identity[1] if columns.key else format(counters[task], '06d')}"
     keys[identity] = key
     return Source(key, task, words, images, record), False
 
 
-def _policy(mapping: Mapping, record: Record, names: Collection[str]) -> PolicyColumns:
+def _policy(columns: Columns, record: Record, names: Collection[str]) -> PolicyColumns:
     """The policy that a row of a long table is about; `names` are those of earlier rows."""
-    column = mapping.policy or ""  # only called for long tables
+    column = columns.policy or ""  # only called for long tables
     name = text(record, column)
-    if name in mapping.policies:
-        return mapping.policies[name]
-    if mapping.default is None:
-        where = "--policies" if mapping.from_flags else str(mapping.file)
-        raise record.error(column, str(UnknownNameError("policy", name, mapping.policies, where)))
+    if name in columns.policies:
+        return columns.policies[name]
+    if columns.default is None:
+        where = "--policies" if columns.from_flags else str(columns.file)
+        raise record.error(column, str(UnknownNameError("policy", name, columns.policies, where)))
     alike = None if name in names else next((other for other in names if _plain(other) == _plain(name)), None)
     if alike is not None:
-        way = "after --policies" if mapping.from_flags else "as [policies.NAME]"
+        way = "after --policies" if columns.from_flags else "as [policies.NAME]"
         raise record.error(column, f"policy {name!r} and {alike!r} differ only in capitals or spaces; write both alike, or name all policies {way}")
-    return replace(mapping.default, name=name)
+    return replace(columns.default, name=name)
 
 
 def _plain(name: str) -> str:
     return " ".join(name.casefold().split())
 
 
-def _repeat(mapping: Mapping, record: Record) -> int | None:
-    if mapping.repeat is None:
+def _repeat(columns: Columns, record: Record) -> int | None:
+    if columns.repeat is None:
         return None
-    value = number(record, mapping.repeat)
+    value = number(record, columns.repeat)
     if value is None or value < 0 or value != int(value):
-        raise record.error(mapping.repeat, f"must be an integer of 0 or more, got {record.values[mapping.repeat]!r}")
+        raise record.error(columns.repeat, f"must be an integer of 0 or more, got {record.values[columns.repeat]!r}")
     return int(value)
 
 
-def _row(mapping: Mapping, record: Record, source: Source, policy: PolicyColumns, repeat: int) -> Row | None:
+def _row(columns: Columns, record: Record, source: Source, policy: PolicyColumns, repeat: int) -> Row | None:
     error = text(record, policy.error) if policy.error is not None and record.values[policy.error] is not None else None
-    success = False if error is not None else _success(mapping, record, policy.success)
+    success = False if error is not None else _success(columns, record, policy.success)
     if success is None:
         return None
     numbers: dict[str, float | None] = {}
@@ -173,7 +173,7 @@ def _row(mapping: Mapping, record: Record, source: Source, policy: PolicyColumns
     if any(name in numbers for name in _WAITING):
         # The three are parts of one wait: what the table does not tell apart is not waited for twice.
         numbers = {**dict.fromkeys(_WAITING, 0.0), **numbers}
-    labels = {label: text(record, column) for label, column in mapping.labels.items()}
+    labels = {label: text(record, column) for label, column in columns.labels.items()}
     steps = numbers.pop("steps", None)
     return Row(
         task=source.task,
@@ -203,7 +203,7 @@ def _row(mapping: Mapping, record: Record, source: Source, policy: PolicyColumns
     )
 
 
-def _success(mapping: Mapping, record: Record, success: Success) -> bool | None:
+def _success(columns: Columns, record: Record, success: Success) -> bool | None:
     """None where the policy did not run."""
     value = record.values[success.column]
     if value is None:
@@ -221,16 +221,16 @@ def _success(mapping: Mapping, record: Record, success: Success) -> bool | None:
     if word == "nan":
         raise record.error(success.column, "is NaN; leave it empty where the policy did not run")
     if _is_number(value):
-        hint = f"a graded outcome is a score, and its success a threshold: {threshold(mapping.from_flags)}"
+        hint = f"a graded outcome is a score, and its success a threshold: {threshold(columns.from_flags)}"
     else:
         hint = "a mapping file (--map) says which words mean it: success = { column = ..., true = [WORDS], false = [WORDS] }"
     raise record.error(success.column, f"must be true or false (or 1 or 0), got {value!r}; {hint}; leave it empty where the policy did not run")
 
 
-def _number(record: Record, policy: PolicyColumns, name: str, terms: Sequence[Term]) -> float:
+def _number(record: Record, policy: PolicyColumns, name: str, terms: Sequence[Term | float]) -> float:
     total = math.fsum(_term(record, term) for term in terms)
     called = policy.called(name)
-    column = next((term.column for term in terms if term.column is not None), None)
+    column = next((term.column for term in terms if isinstance(term, Term)), None)
 
     def error(problem: str) -> DataError:
         problem = f"{called} must {problem}, got {total:g}"
@@ -244,9 +244,9 @@ def _number(record: Record, policy: PolicyColumns, name: str, terms: Sequence[Te
     return total
 
 
-def _term(record: Record, term: Term) -> float:
-    if term.column is None:
-        return term.offset
+def _term(record: Record, term: Term | float) -> float:
+    if not isinstance(term, Term):
+        return term
     if term.count in _COUNTS:
         value: float | None = _COUNTS[term.count](text(record, term.column))
         if term.divide is not None:
@@ -270,8 +270,8 @@ def _divided(record: Record, value: float, divide: str) -> float:
     return value / by
 
 
-def _duplicate(mapping: Mapping, record: Record, first: Record, what: str) -> DataError:
-    if mapping.from_flags:
+def _duplicate(columns: Columns, record: Record, first: Record, what: str) -> DataError:
+    if columns.from_flags:
         ways = "name a column of repeats (--repeat-column), or say what it means: --duplicates drop or repeats (in a wide table also keep)"
     else:
         ways = 'name a column of repeats, or say what it means with duplicates = "drop" or "repeats" (in a wide table also "keep")'

@@ -1,27 +1,13 @@
-"""The command line's flags as what a mapping file would hold; what is wrong with it names the flag."""
+"""The command line's flags as the data that a mapping file would hold."""
 
 from typing import Any
 
-from osel_sim.core.errors import ContentError, UsageError, did_you_mean
-from osel_sim.formats.validate import Table
-from osel_sim.ingestion.mapping import COMMAND_LINE, VALUES, flag
+from osel_sim.core.errors import UsageError, did_you_mean
+from osel_sim.ingestion.columns import VALUES
 
 
-class FlagTable(Table):
-    """A mapping's table that was made of flags: errors name the flag where those of a file name the key."""
-
-    def error(self, key: str, problem: str) -> ContentError:
-        """An error about one flag, to be raised."""
-        return ContentError(self.file, flag(self.prefix + key), problem)
-
-    def table(self, key: str, default: Any = ...) -> Table:
-        """A table within this one."""
-        part = super().table(key, default)
-        return FlagTable(part.data, part.file, part.prefix)
-
-
-def as_table(options: Any, files: tuple[str, ...]) -> FlagTable:
-    """A mapping's table.
+def as_data(options: Any, files: tuple[str, ...]) -> dict[str, Any]:
+    """What a mapping file would hold.
 
     Args:
         options: the flags of `osel_sim.ingest`.
@@ -56,7 +42,7 @@ def as_table(options: Any, files: tuple[str, ...]) -> FlagTable:
                 raise UsageError(f"--{key}: {item!r} is the second value for all policies; write POLICY=VALUE, with the policies after --policies")
             else:
                 outcome[key] = _value(key, item, options.at_least)
-    data = {
+    return {
         "version": 1,
         "name": options.name or options.out.resolve().name,
         "table": {"files": list(files)},
@@ -64,7 +50,6 @@ def as_table(options: Any, files: tuple[str, ...]) -> FlagTable:
         "outcome": {key: value for key, value in outcome.items() if value is not None},
         "policies": policies,
     }
-    return FlagTable(data, COMMAND_LINE)
 
 
 def _value(key: str, text: str, at_least: float | None) -> Any:

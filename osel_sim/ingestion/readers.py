@@ -18,7 +18,7 @@ from typing import Any
 
 from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError, did_you_mean
-from osel_sim.ingestion.mapping import Join, Mapping, flag
+from osel_sim.ingestion.columns import Columns, Join, flag
 
 _CAPTURE = re.compile(r"\\\{([A-Za-z_][A-Za-z0-9_]*)\\\}")
 _LONGEST_FIELD = 64 * 1024 * 1024
@@ -51,19 +51,19 @@ class Record:
         return DataError(f"{self.where}, column {column!r}: {problem}")
 
 
-def read_tables(mapping: Mapping) -> list[Record]:
-    """All rows of a mapping's files in the order of the files' names, with the joined columns.
+def read_tables(columns: Columns) -> list[Record]:
+    """All rows of the tables' files in the order of the files' names, with the joined columns.
 
     Raises:
-        DataError: a file is missing, empty, cut, of a wrong form, or lacks a column that the mapping names.
+        DataError: a file is missing, empty, cut, of a wrong form, or lacks a column that is named.
     """
-    records = _read_all(mapping.base, mapping.files)
-    for join in mapping.joins:
-        records = _joined(records, _read_all(mapping.base, join.files), join)
-    columns = records[0].values.keys()
-    for column, key in mapping.columns.items():
-        if column not in columns:
-            who = f"{flag(key)} names" if mapping.from_flags else f"{mapping.file} names as {key}"
+    records = _read_all(columns.base, columns.files)
+    for join in columns.joins:
+        records = _joined(records, _read_all(columns.base, join.files), join)
+    there = records[0].values.keys()
+    for column, key in columns.needed.items():
+        if column not in there:
+            who = f"{flag(key)} names" if columns.from_flags else f"{columns.file} names as {key}"
             raise DataError(f"{records[0].file}: there is no column {column!r}, which {who}: {_instead(records[0], column)}")
     return records
 

@@ -1,12 +1,10 @@
 """Asking a policy for actions, with what the answer took: the same for a policy on the robot and one behind a network."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
+from osel_sim.interface.environment import Environment
 from osel_sim.interface.policy import Actions, Observation
-
-if TYPE_CHECKING:
-    from osel_sim.sim.env import TaskEnv
 
 
 @dataclass(frozen=True)
@@ -14,7 +12,7 @@ class Call:
     """One answer of a policy.
 
     Attributes:
-        actions: (T, 7) float32 in [-1, 1]; None exactly when the call failed.
+        actions: (T, D) float32 within the environment's bounds; None exactly when the call failed.
         upload, inference, download: seconds on the virtual clock; deterministic, never this machine's speed.
         megabytes: moved both ways (10^6 bytes); 0 for a local policy.
         measured_seconds: what the call really took here; for `timing.jsonl` only.
@@ -64,6 +62,6 @@ class Caller(Protocol):
 class Privileged(Protocol):
     """A caller that wants to see the world itself; the episode loop shows it the environment before anything else."""
 
-    def bind(self, env: "TaskEnv") -> None:
+    def bind(self, env: Environment) -> None:
         """Remember the environment of the coming episode. It must be looked at, never changed."""
         ...

@@ -10,7 +10,7 @@ from osel_sim.core.shown import shown
 class Seconds:
     """Where an episode's time went, in seconds on the virtual clock (never this machine's speed).
 
-    While a remote call is answered the robot holds still and physics goes on, so `motion` (steps / 20 Hz) already contains that wait.
+    While a remote call is answered the robot holds still and physics goes on, so `motion` (steps / control rate) already contains that wait.
     """
 
     upload: float = 0.0
@@ -26,7 +26,7 @@ class Outcome:
     Attributes:
         success: the goal predicates held at the end.
         subgoals: fraction of the task's subgoals reached, in [0, 1].
-        steps: control steps at 20 Hz, waiting included.
+        steps: control steps, waiting included.
         seconds: upload, inference, download, motion.
         calls: how often the policy was asked for a chunk of actions.
         actions: how many of its actions were executed.

@@ -9,16 +9,12 @@ Observation = dict[str, Any]
 """LeRobot's names:
 
 - `observation.images.<camera>`: uint8 (H, W, 3), RGB, for each camera the policy file names;
-- `observation.state`: float32 (8,): gripper position (3, metres, world), its orientation as axis-angle (3, radians), two finger positions (metres);
+- `observation.state`: float32 (S,): the parts that the environment's specification lists, one after the other; absent where it lists none;
 - `task`: the instruction.
 """
 
 Actions = NDArray[np.float32]
-"""A chunk (T, 7): OSC_POSE deltas (x, y, z, roll, pitch, yaw) and gripper (-1 open, +1 closed), each in [-1, 1], at 20 Hz."""
-
-ACTION_DIM = 7
-STATE_DIM = 8
-CONTROL_HZ = 20
+"""A chunk (T, D) of actions; the environment's specification says what the D components mean, their bounds, and how many steps a second are made."""
 
 
 class Policy(Protocol):
@@ -29,5 +25,5 @@ class Policy(Protocol):
         ...
 
     def act(self, observation: Observation) -> Actions:
-        """The next chunk of actions, (T, 7) float32 in [-1, 1]."""
+        """The next chunk of actions, (T, D) float32."""
         ...

@@ -37,6 +37,7 @@ class Gripper:
         model: its class in robosuite, `module:Class`.
         rest: its joints when it is open, in the model's order, radians or metres.
         closing: for each of its actuators 1 or -1: the way in which a positive command moves its control.
+        tip: metres that the scripted expert keeps its closed fingers further off a button, for what they reach further down than the Panda's.
         prepare: changes robosuite's model of it (`robosuite.models.grippers.GripperModel`) before it is mounted.
         speed: how much a control step changes the command, which runs from -1 (open) to 1 (closed).
         left, right: colliding geoms of each finger.
@@ -50,6 +51,7 @@ class Gripper:
     left: tuple[str, ...]
     right: tuple[str, ...]
     pads: tuple[str, str] | None = None
+    tip: float = 0.0
     prepare: Callable[[Any], None] | None = None
     speed: float = 0.2
 
@@ -99,6 +101,7 @@ class Robot:
             each lifts the hand there (n,).
         nearer: metres by which its base stands nearer to the table than robosuite puts it.
         grip_site, base_site: the pose that is controlled, and the frame in which actions are given.
+        centred: metres by which a thing may be off the middle of the gripper when the scripted expert begins to close it.
         lowering: largest downward motion that the scripted expert asks of it while it puts something down, in units of action.
     """
 
@@ -114,6 +117,7 @@ class Robot:
     base_site: str = "robot0_right_center"
     wrist_camera: WristCamera = WristCamera()
     meshes: LightMeshes = LightMeshes()
+    centred: float = math.inf
     lowering: float = math.inf
 
     def __post_init__(self) -> None:

@@ -9,23 +9,30 @@ from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
 
 from osel_sim.core.errors import CheckpointError, nearest
-from osel_sim.formats.mapping import ENVIRONMENT_STATES, STATE_PARTS, Mapping
+from osel_sim.formats.conventions import ENVIRONMENT_STATES, Conventions
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.interface.policy import ACTION_DIM
+from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
+from osel_sim.policy.mapping import known_parts, state_size, wanted_parts
 
 PREPROCESSOR = "policy_preprocessor.json"
 
 
-def check_fit(spec: PolicySpec, config: PreTrainedConfig, seen: Collection[str] = ()) -> None:
+def check_fit(spec: PolicySpec, config: PreTrainedConfig, environment: EnvironmentSpec, seen: Collection[str] = ()) -> None:
     """Whether the policy file gives what a checkpoint wants.
 
     Args:
+        environment: what it will drive.
         seen: images that the checkpoint's own preprocessor looks at to make `observation.environment_state`.
 
     Raises:
         CheckpointError: saying what the checkpoint wants, what the policy file gives, and what to write instead.
     """
-    problems = [*_images(spec, [*config.image_features, *seen]), *_state(spec, config), *_action(spec, config), *_others(spec, config, bool(seen))]
+    problems = [
+        *_images(spec, [*config.image_features, *seen]),
+        *_state(spec, config, environment),
+        *_action(spec, config, environment.action),
+        *_others(spec, config, bool(seen)),
+    ]
     if problems:
         raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} does not fit: {'; '.join(problems)}")
 
@@ -68,7 +75,7 @@ def check_processors(spec: PolicySpec, checkpoint: str) -> None:
         )
 
 
-def camera_keys(mapping: Mapping, cameras: tuple[str, ...]) -> dict[str, str]:
+def camera_keys(mapping: Conventions, cameras: tuple[str, ...]) -> dict[str, str]:
     """Checkpoint's image key -> camera here."""
     return {mapping.key(camera): camera for camera in cameras}
 
@@ -86,26 +93,28 @@ def _images(spec: PolicySpec, wanted: list[str]) -> Iterator[str]:
             yield f"[mapping] gives it {key}, which it does not know" + (f": did you mean {meant[0]!r}?" if meant else "")
 
 
-def _state(spec: PolicySpec, config: PreTrainedConfig) -> Iterator[str]:
-    wanted, mapping = config.robot_state_feature, spec.mapping
-    if wanted is None or tuple(wanted.shape) == (mapping.state_size,):
+def _state(spec: PolicySpec, config: PreTrainedConfig, environment: EnvironmentSpec) -> Iterator[str]:
+    wanted, size = config.robot_state_feature, state_size(spec.mapping, environment)
+    if wanted is None or tuple(wanted.shape) == (size,):
         return
-    parts = " + ".join(f"{part} {STATE_PARTS[part]}" for part in mapping.state_parts)
-    sizes = ", ".join(f"{part} {size}" for part, size in STATE_PARTS.items())
+    known = known_parts(environment)
+    parts = " + ".join(f"{part} {known[part]}" for part in wanted_parts(spec.mapping, environment))
+    sizes = ", ".join(f"{part} {numbers}" for part, numbers in known.items())
     yield (
-        f"it wants {OBS_STATE} of shape {tuple(wanted.shape)}, the simulation gives ({mapping.state_size},): {parts} "
+        f"it wants {OBS_STATE} of shape {tuple(wanted.shape)}, the simulation gives ({size},): {parts or 'nothing'} "
         f"([mapping] state_parts can be put together from {sizes})"
     )
 
 
-def _action(spec: PolicySpec, config: PreTrainedConfig) -> Iterator[str]:
+def _action(spec: PolicySpec, config: PreTrainedConfig, robot: ActionSpec) -> Iterator[str]:
     action, columns = config.action_feature, spec.mapping.columns
     if action is None or len(action.shape) != 1:
-        yield f"it gives {ACTION} of shape {tuple(action.shape) if action else 'none'}, the robot takes (7,)"
+        yield f"it gives {ACTION} of shape {tuple(action.shape) if action else 'none'}, the robot takes ({robot.dimension},)"
         return
     size = action.shape[0]
-    if not columns and size != ACTION_DIM:
-        yield f"it gives {ACTION} of shape ({size},), the robot takes ({ACTION_DIM},): six motions and the gripper; say in [mapping] columns which"
+    if not columns and size != robot.dimension:
+        names = ", ".join(robot.names)
+        yield f"it gives {ACTION} of shape ({size},), the robot takes ({robot.dimension},): {names}; say in [mapping] columns which"
     elif columns and max(columns) >= size:
         yield f"[mapping] columns names number {max(columns)} of an action, it gives {ACTION} of shape ({size},)"
 

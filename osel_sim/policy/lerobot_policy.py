@@ -25,6 +25,7 @@ from osel_sim.core.hub import download, offline_if_unreachable
 from osel_sim.core.torch_settings import threads
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Actions, Observation, Policy
 from osel_sim.policy import register
 from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors
@@ -34,7 +35,7 @@ from osel_sim.policy.text import embed
 from osel_sim.policy.trust import check_checkpoint
 
 
-def load(spec: PolicySpec) -> Callable[[], Policy]:
+def load(spec: PolicySpec, environment: EnvironmentSpec) -> Callable[[], Policy]:
     """Load the weights once; the result makes sessions that share them, each with its own state.
 
     Raises:
@@ -54,11 +55,11 @@ def load(spec: PolicySpec) -> Callable[[], Policy]:
         check_processors(spec, checkpoint)
         processors = _processors(spec, checkpoint, config, device)
         seen = {key: shape for step in processors[0].steps if isinstance(step, PerceptionStep) for key, shape in step.image_shapes.items()}
-        check_fit(spec, config, seen)
+        check_fit(spec, config, environment, seen)
         policy = _weights(spec, checkpoint, config)
         check_normalisation(spec, config, *processors)
     images = {**{key: tuple(feature.shape) for key, feature in config.image_features.items()}, **seen}
-    return lambda: LeRobotPolicy(spec, policy, processors, images)
+    return lambda: LeRobotPolicy(spec, policy, processors, images, environment)
 
 
 class LeRobotPolicy:
@@ -66,9 +67,18 @@ class LeRobotPolicy:
 
     Args:
         images: shape (3, H, W) of every image that the policy or its preprocessor looks at.
+        environment: what it drives.
     """
 
-    def __init__(self, spec: PolicySpec, policy: PreTrainedPolicy, processors: tuple[Any, Any], images: dict[str, tuple[int, ...]]) -> None:
+    def __init__(
+        self,
+        spec: PolicySpec,
+        policy: PreTrainedPolicy,
+        processors: tuple[Any, Any],
+        images: dict[str, tuple[int, ...]],
+        environment: EnvironmentSpec,
+    ) -> None:
+        self._environment = environment
         eyes = [step.perception.parameters() for step in processors[0].steps if isinstance(step, PerceptionStep)]
         shared = {id(tensor): tensor for tensor in chain(policy.parameters(), policy.buffers(), *eyes)}
         self._policy, self._before, self._after = copy.deepcopy((policy, *processors), shared)  # own queues and caches, shared weights
@@ -88,7 +98,7 @@ class LeRobotPolicy:
         self._after.reset()
 
     def act(self, observation: Observation) -> Actions:
-        """The next chunk of actions, (T, 7) float32 in [-1, 1]; the same bits for the same observations since the last reset.
+        """The next chunk of actions, (T, D) float32; the same bits for the same observations since the last reset.
 
         A policy that looks at several observations is asked for one action at a time, as its own memory of them wants it.
         """
@@ -98,17 +108,18 @@ class LeRobotPolicy:
             size = shape[-2:]
             batch[key] = _image(observation[f"{OBS_IMAGES}.{self._cameras[key]}"], size) if key in self._cameras else torch.zeros(3, *size)
         if config.robot_state_feature is not None:
-            batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping))
+            batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping, self._environment))
         if self._context is not None:
             batch[OBS_ENV_STATE] = self._context
         with torch.inference_mode(), threads(1), no_foreign_code(), drawing(self._instruction, self._calls):
             prepared = {key: value for key, value in self._before(batch).items() if isinstance(value, Tensor)}
-            # the postprocessor knows single actions (batch, 7): a chunk's steps take the batch's place
+            # the postprocessor knows single actions (batch, D): a chunk's steps take the batch's place
             stepwise = (config.n_obs_steps or 1) > 1
             chunk = self._policy.select_action(prepared) if stepwise else self._policy.predict_action_chunk(prepared)[0]
             actions = self._after(chunk)
         self._calls += 1
-        return actions_of(actions.float().cpu().numpy(), self._mapping).clip(-1.0, 1.0).astype(np.float32)
+        action = self._environment.action
+        return action.clip(actions_of(actions.float().cpu().numpy(), self._mapping, action))
 
 
 def _folder(spec: PolicySpec, checkpoint: str) -> Path:

@@ -2,11 +2,12 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from osel_sim.core.errors import UsageError
 from osel_sim.formats.policy_file import PolicySpec, Price
+from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Policy
 
 OBJECT = "object"
@@ -25,12 +26,16 @@ class PolicyObject:
     spec: PolicySpec
     policy: Policy
 
+    def spec_for(self, environment: EnvironmentSpec) -> PolicySpec:
+        """What a policy file would say of it, with all cameras of an environment where it names none."""
+        return self.spec if self.spec.cameras else replace(self.spec, cameras=environment.cameras)
+
 
 def as_policy(
     policy: Policy,
     name: str | None = None,
     *,
-    cameras: Sequence[str] = ("agentview", "wrist"),
+    cameras: Sequence[str] | None = None,
     image_size: int = 96,
     execute: int = 1000,
     inference_seconds: float = 0.0,
@@ -39,9 +44,9 @@ def as_policy(
     """Say what a policy file would say of a policy object.
 
     Args:
-        policy: an object with `reset(instruction)` and `act(observation)`, which returns actions (T, 7) float32 in [-1, 1].
+        policy: an object with `reset(instruction)` and `act(observation)`, which returns actions (T, D) float32.
         name: what it is called; None: its class's name in small letters.
-        cameras, image_size: what it is shown (square, pixels).
+        cameras, image_size: what it is shown (square, pixels); None: all cameras that there are.
         execute: actions of each chunk that are executed before it is asked again; at most the chunk's length.
         inference_seconds: declared time of one inference on the virtual clock.
         price_per_action: cents for each executed action.
@@ -52,8 +57,9 @@ def as_policy(
     for method in ("reset", "act"):
         if not callable(getattr(policy, method, None)):
             raise UsageError(f"policy {type(policy).__name__!r} has no method {method!r}; a policy has reset(instruction) and act(observation)")
-    if image_size < 16 or execute < 1 or inference_seconds < 0 or price_per_action < 0:
-        raise UsageError("a policy's image_size must be 16 or more, execute 1 or more, inference_seconds and price_per_action 0 or more")
+    if not (16 <= image_size <= 1024 and 1 <= execute <= 1000 and 0 <= inference_seconds <= 3600 and 0 <= price_per_action <= 1e6):
+        ranges = "image_size in [16, 1024], execute in [1, 1000], inference_seconds in [0, 3600] and price_per_action in [0, 1000000]"
+        raise UsageError(f"a policy's numbers must lie in these ranges, as in a policy file: {ranges}")
     kind = type(policy)
     name = name or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower()
     spec = PolicySpec(
@@ -61,7 +67,7 @@ def as_policy(
         title=f"{kind.__name__} (a Python object)",
         kind=OBJECT,
         checkpoint="",
-        cameras=tuple(cameras),
+        cameras=tuple(cameras or ()),
         image_size=image_size,
         execute=execute,
         inference_seconds=inference_seconds,

@@ -14,7 +14,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.core.errors import PolicyError, RemoteError
 from osel_sim.core.shown import shown
-from osel_sim.formats.mapping import Mapping
+from osel_sim.formats.conventions import Conventions
+from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Actions, Observation
 from osel_sim.policy.local import check_actions
 from osel_sim.policy.mapping import actions_of, message_of
@@ -30,7 +31,7 @@ class Answer:
     """What came back for one observation.
 
     Attributes:
-        actions: (T, 7) float32 in [-1, 1].
+        actions: (T, D) float32 within the environment's bounds.
         measured_seconds: from sending to having it, on this machine.
         bytes_up, bytes_down: length of the two frames; the answer's without its timing entries, which would make a price depend on the machine.
     """
@@ -48,6 +49,7 @@ class RemoteClient:
 
     Args:
         url: `ws://host:port` or `wss://...`.
+        environment: what the actions are for; they are checked and clipped accordingly.
         token: sent as `Authorization: Api-Key ...`; none is sent if it is None or empty.
         timeout: real seconds for one answer, and for connecting.
         expect: what a server of ours must say it is; None takes any.
@@ -58,13 +60,20 @@ class RemoteClient:
     """
 
     def __init__(
-        self, url: str, token: str | None = None, timeout: float = 30.0, expect: Greeting | None = None, mapping: Mapping | None = None
+        self,
+        url: str,
+        environment: EnvironmentSpec,
+        token: str | None = None,
+        timeout: float = 30.0,
+        expect: Greeting | None = None,
+        mapping: Conventions | None = None,
     ) -> None:
+        self._environment = environment
         self.url = shown(url)
         """The address without what is secret in it; errors begin with it."""
         self._address, self._timeout, self._expect = url, timeout, expect
         self._token = None if token is None else check_header(token)
-        self._mapping = mapping or Mapping()
+        self._mapping = mapping or Conventions()
         self._connection: ClientConnection | None = None
         self._hang_up = contextlib.ExitStack()
         self._greeting: Greeting | None = None
@@ -101,6 +110,10 @@ class RemoteClient:
             self._greeting = Greeting.parse(metadata)
         except ProtocolError as error:
             raise self._fail(str(error)) from None
+        there, here = self._greeting, (self._environment.action.dimension, self._environment.state_size)
+        if there is not None and (there.action_dim, there.state_dim) != here:
+            theirs = f"{there.action_dim} and {there.state_dim} numbers"
+            raise self._fail(f"its actions and states have {theirs}, those of the environment of {self._environment.name} {here[0]} and {here[1]}")
         if self._greeting is not None and self._expect is not None and self._greeting != self._expect:
             raise self._fail(f"serves {self._greeting}, expected {self._expect}")
 
@@ -124,16 +137,18 @@ class RemoteClient:
             RemoteError: timeout, closed, an error message, or an answer without proper actions.
         """
         start = time.perf_counter()
+        environment = self._environment
         if self._connection is None:
             raise RemoteError(f"{self.url}: not connected")
-        reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation)) if self.foreign else observation)
+        reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation), environment) if self.foreign else observation)
         measured = time.perf_counter() - start
         key = self._mapping.actions if self.foreign else "actions"
         if not isinstance(reply, dict) or key not in reply:
             got = ", ".join(sorted(str(name)[:40] for name in list(reply)[:10])) if isinstance(reply, dict) else type(reply).__name__
             raise self._fail(f"answered without {key} (it has: {got or 'nothing'})")
         try:
-            actions = check_actions(actions_of(reply[key], self._mapping) if self.foreign else reply[key])
+            own = actions_of(reply[key], self._mapping, environment.action) if self.foreign else reply[key]
+            actions = check_actions(own, environment.action)
         except PolicyError as error:
             raise self._fail(str(error)) from None
         payload = {key: value for key, value in reply.items() if not (isinstance(key, str) and key.endswith("timing"))}

@@ -7,12 +7,14 @@ import time
 from osel_sim.core.errors import RemoteError, UsageError
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.call import Call
+from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Observation
+from osel_sim.policy.environment_fit import check_environment
 from osel_sim.policy.mapping import message_of
 from osel_sim.remote.client import Answer, RemoteClient
 from osel_sim.remote.network import Delays, NetworkModel, NetworkProfile, profile
 from osel_sim.remote.process import PolicyServerProcess
-from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, example_observation, select_observation
+from osel_sim.remote.protocol import STATE, TOKEN_VARIABLE, Greeting, example_observation, select_observation
 
 DEADLINE = "deadline"
 OUTAGE = "outage"
@@ -96,7 +98,7 @@ class RemotePolicy:
         if self._broken is not None:
             return None
         try:
-            return self._client.act(select_observation(observation, self._spec.cameras))
+            return self._client.act(select_observation(observation, self._spec.cameras, STATE in observation))
         except RemoteError as error:
             self._broken = self._reason(error)
             return None
@@ -106,12 +108,13 @@ class RemotePolicy:
         return str(error).removeprefix(f"{self._client.url}: ")
 
 
-def open_remote(spec: PolicySpec, timeout: float = 30.0, start_timeout: float = 120.0) -> RemotePolicy:
+def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float = 30.0, start_timeout: float = 120.0) -> RemotePolicy:
     """A remote policy ready for use: connects to the `url` of its file, with the token in OSEL_SIM_TOKEN, or starts a server of its own.
 
     Close it after use.
 
     Args:
+        environment: what it will drive.
         timeout: real seconds for one answer.
         start_timeout: real seconds for a server to load its weights, or for one that is not ours to answer its first request.
 
@@ -121,16 +124,18 @@ def open_remote(spec: PolicySpec, timeout: float = 30.0, start_timeout: float = 
     """
     if spec.remote is None:
         raise UsageError(f"{spec.file}: is not a remote policy")
+    check_environment(spec, environment)
     if spec.remote.url is not None:
-        client = RemoteClient(spec.remote.url, os.environ.get(TOKEN_VARIABLE), timeout, Greeting.of(spec), spec.mapping)
+        token = os.environ.get(TOKEN_VARIABLE)
+        client = RemoteClient(spec.remote.url, environment, token, timeout, Greeting.of(spec, environment), spec.mapping)
         client.connect()
         if client.foreign:
             client.close()
             # A server that compiles its model with the first request takes long for it.
-            _try_mapping(spec, RemoteClient(spec.remote.url, os.environ.get(TOKEN_VARIABLE), start_timeout, mapping=spec.mapping))
+            _try_mapping(spec, environment, RemoteClient(spec.remote.url, environment, token, start_timeout, mapping=spec.mapping))
         return RemotePolicy(spec, client)
     with contextlib.ExitStack() as undo:
-        server = PolicyServerProcess(spec, timeout, start_timeout)
+        server = PolicyServerProcess(spec, environment, timeout, start_timeout)
         undo.callback(server.close)
         client = server.start_client()
         client.connect()
@@ -138,16 +143,16 @@ def open_remote(spec: PolicySpec, timeout: float = 30.0, start_timeout: float = 
     return RemotePolicy(spec, client, server=server)
 
 
-def _try_mapping(spec: PolicySpec, client: RemoteClient) -> None:
+def _try_mapping(spec: PolicySpec, environment: EnvironmentSpec, client: RemoteClient) -> None:
     """Ask a server that is not ours once, so that a wrong mapping is found now and explained, instead of failing every episode."""
-    example = example_observation(Greeting.of(spec))
+    example = example_observation(Greeting.of(spec, environment))
     try:
         with client:
             length = len(client.act(example).actions)
     except RemoteError as error:
         sent = ", ".join(
             f"{key} ({value.dtype} {value.shape})" if hasattr(value, "shape") else f"{key} (text)"
-            for key, value in message_of(example, spec.mapping, spec.cameras).items()
+            for key, value in message_of(example, spec.mapping, spec.cameras, environment).items()
         )
         raise RemoteError(f"{spec.file}: the server does not take what the file's [mapping] gives it: {error}; it was sent {sent}") from None
     if length < spec.execute:

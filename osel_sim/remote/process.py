@@ -13,6 +13,7 @@ from typing import IO, Self
 
 from osel_sim.core.errors import RemoteError
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting
 
@@ -28,11 +29,13 @@ class PolicyServerProcess:
 
     Args:
         spec: which policy.
+        environment: what it will drive.
         timeout: real seconds for one answer, of the clients given out.
         start_timeout: real seconds for loading the weights.
     """
 
-    def __init__(self, spec: PolicySpec, timeout: float = 30.0, start_timeout: float = 120.0) -> None:
+    def __init__(self, spec: PolicySpec, environment: EnvironmentSpec, timeout: float = 30.0, start_timeout: float = 120.0) -> None:
+        self._environment = environment
         self._spec, self._timeout, self._start_timeout = spec, timeout, start_timeout
         self._process: subprocess.Popen[str] | None = None
         self._errors: IO[str] | None = None
@@ -67,9 +70,9 @@ class PolicyServerProcess:
         self.close()
         self.token = secrets.token_urlsafe(32)
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed in close()
-        name, folder = self._spec.file.stem, self._spec.file.parent
+        name, folder, environment = self._spec.file.stem, str(self._spec.file.parent), json.dumps(self._environment.to_dict())
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "osel_sim.serve", name, "--port", "0", "--policies-dir", str(folder), "--watch-stdin"],
+            [sys.executable, "-m", "osel_sim.serve", name, "--port=0", "--policies-dir", folder, "--environment", environment, "--watch-stdin"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
@@ -90,7 +93,7 @@ class PolicyServerProcess:
             RemoteError: as `start`.
         """
         self.start()
-        return RemoteClient(self.url, self.token, self._timeout, Greeting.of(self._spec))
+        return RemoteClient(self.url, self._environment, self.token, self._timeout, Greeting.of(self._spec, self._environment))
 
     def close(self) -> None:
         """Stop the server: politely, then not. May be called twice."""

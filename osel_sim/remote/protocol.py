@@ -1,13 +1,13 @@
 """What policy server and client say to each other.
 
 As in openpi (websocket_policy_server.py): the server greets with a metadata map, then answers each observation map with a map that holds `actions`
-(T, 7); a text message is an error. On top of that a server of ours says so in its greeting (`protocol`), and then understands `{"osel_sim/reset":
+(T, D); a text message is an error. On top of that a server of ours says so in its greeting (`protocol`), and then understands `{"osel_sim/reset":
 instruction}`, answered with the same map. A client without that word works as well: a session starts over by itself when the observation's `task`
 changes.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,8 @@ import numpy as np
 from osel_sim.core.errors import OselError, UsageError
 from osel_sim.core.shown import TOKEN_VARIABLE as TOKEN_VARIABLE  # where others look for it
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.interface.policy import ACTION_DIM, STATE_DIM, Observation
+from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
+from osel_sim.interface.policy import Observation
 from osel_sim.remote.codec import ProtocolError
 
 PROTOCOL = "osel_sim/1"
@@ -33,18 +34,25 @@ class ObservationError(OselError):
 
 @dataclass(frozen=True)
 class Greeting:
-    """What a server of ours says first."""
+    """What a server of ours says first.
+
+    Attributes:
+        cameras, image_size: what it wants to be shown (square, pixels).
+        action_dim, state_dim: how many numbers its actions have, and the states it wants; 0: no state.
+        action: bounds that the server clips actions to; None: clients do. It is not sent.
+    """
 
     policy: str
     cameras: tuple[str, ...]
     image_size: int
-    action_dim: int = ACTION_DIM
-    state_dim: int = STATE_DIM
+    action_dim: int
+    state_dim: int
+    action: ActionSpec | None = field(default=None, compare=False, repr=False)
 
     @classmethod
-    def of(cls, spec: PolicySpec) -> "Greeting":
-        """The greeting of the server of one policy file."""
-        return cls(spec.name, spec.cameras, spec.image_size)
+    def of(cls, spec: PolicySpec, environment: EnvironmentSpec) -> "Greeting":
+        """The greeting of the server of one policy file, which drives in an environment."""
+        return cls(spec.name, spec.cameras, spec.image_size, environment.action.dimension, environment.state_size, environment.action)
 
     def to_dict(self) -> dict[str, Any]:
         """The metadata map as it is sent."""
@@ -72,26 +80,28 @@ class Greeting:
             return None
         if protocol != PROTOCOL:
             raise ProtocolError(f"the server speaks {protocol[:40]!r}, this client {PROTOCOL!r}")
-        policy, cameras, size = (metadata.get(key) for key in ("policy", "cameras", "image_size"))
+        policy, cameras = metadata.get("policy"), metadata.get("cameras")
+        sizes: list[Any] = [metadata.get(key) for key in ("image_size", "action_dim", "state_dim")]
         if (
             not isinstance(policy, str)
             or not isinstance(cameras, list)
             or not all(isinstance(item, str) for item in cameras)
-            or type(size) is not int
+            or not all(type(size) is int for size in sizes)
         ):
-            raise ProtocolError("the greeting lacks policy, cameras or image_size")
-        if metadata.get("action_dim") != ACTION_DIM or metadata.get("state_dim") != STATE_DIM:
-            raise ProtocolError(f"the server's actions and states must have {ACTION_DIM} and {STATE_DIM} numbers")
-        return cls(policy, tuple(cameras), size)
+            raise ProtocolError("the greeting lacks policy, cameras, image_size, action_dim or state_dim")
+        return cls(policy, tuple(cameras), *sizes)
 
 
-def select_observation(observation: Observation, cameras: tuple[str, ...]) -> Observation:
+def select_observation(observation: Observation, cameras: tuple[str, ...], state: bool = True) -> Observation:
     """Only what goes over the wire: the policy's own cameras, state and task.
+
+    Args:
+        state: whether the environment has one.
 
     Raises:
         ObservationError: one of them is missing.
     """
-    keys = [*(IMAGES + camera for camera in cameras), STATE, TASK]
+    keys = [*(IMAGES + camera for camera in cameras), *([STATE] if state else []), TASK]
     missing = [key for key in keys if key not in observation]
     if missing:
         raise ObservationError(f"the observation lacks {', '.join(missing)}")
@@ -106,18 +116,21 @@ def check_observation(value: Any, greeting: Greeting) -> Observation:
     """
     if not isinstance(value, dict):
         raise ObservationError(f"an observation must be a map, got {type(value).__name__}")
-    expected = {*(IMAGES + camera for camera in greeting.cameras), STATE, TASK}
+    expected = {*(IMAGES + camera for camera in greeting.cameras), *([STATE] if greeting.state_dim else []), TASK}
     if value.keys() != expected:
         got = ", ".join(sorted(str(key)[:60] for key in list(value)[:20])) or "none"
         raise ObservationError(f"expected the keys {', '.join(sorted(expected))}, got {got}")
     shape = (greeting.image_size, greeting.image_size, 3)
     for camera in greeting.cameras:
         _array(value, IMAGES + camera, ("uint8",), shape)
+    checked = {**value, TASK: check_instruction(value[TASK])}
+    if not greeting.state_dim:
+        return checked
     with np.errstate(over="ignore"):
         state = _array(value, STATE, ("float32", "float64"), (greeting.state_dim,)).astype(np.float32)
     if not np.isfinite(state).all():
         raise ObservationError(f"{STATE} contains NaN or infinity")
-    return {**value, STATE: state, TASK: check_instruction(value[TASK])}
+    return {**checked, STATE: state}
 
 
 def check_instruction(value: Any) -> str:
@@ -137,7 +150,8 @@ def example_observation(greeting: Greeting) -> Observation:
     """Zeros in the right form: to warm a policy up, and for tests."""
     size = greeting.image_size
     images = {IMAGES + camera: np.zeros((size, size, 3), np.uint8) for camera in greeting.cameras}
-    return {**images, STATE: np.zeros(greeting.state_dim, np.float32), TASK: "pick up the can"}
+    state = {STATE: np.zeros(greeting.state_dim, np.float32)} if greeting.state_dim else {}
+    return {**images, **state, TASK: "pick up the can"}
 
 
 def largest_observation(greeting: Greeting) -> int:

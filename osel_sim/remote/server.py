@@ -11,13 +11,14 @@ from concurrent.futures import ThreadPoolExecutor
 from http import HTTPStatus
 from typing import Any, TypeVar
 
+import numpy as np
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from osel_sim.core.errors import OselError, PolicyError, RemoteError
 from osel_sim.interface.policy import Policy
-from osel_sim.policy.local import check_actions
+from osel_sim.policy.local import check_form
 from osel_sim.policy.registry import MakeSession
 from osel_sim.remote.codec import ProtocolError, pack, unpack
 from osel_sim.remote.protocol import (
@@ -64,7 +65,8 @@ class Session:
         if observation[TASK] != self._instruction:
             self._reset(observation[TASK])
         start = time.perf_counter()
-        actions = check_actions(self._policy.act(observation))
+        actions = check_form(self._policy.act(observation), self._greeting.action_dim)
+        actions = actions.astype(np.float32) if self._greeting.action is None else self._greeting.action.clip(actions)
         return pack({"actions": actions, "server_timing": {"infer_ms": 1e3 * (time.perf_counter() - start)}})
 
     def _reset(self, instruction: str) -> None:

@@ -15,7 +15,7 @@ from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.features import Array, Features, Sketch
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
-from osel_sim.statistics.best import gauss_hermite, probability_of_best
+from osel_sim.statistics.best import probability_of_best
 
 INTERCEPT = 0.5
 """Prior variance of a policy's mean reward, in units of the noise. Strong: no context is needed to find the best single policy."""
@@ -138,7 +138,7 @@ class BayesianSelector(SelectorBase):
         # 1 / variance is how many decisions, this policy's, told about contexts like this one.
         optimism = self.optimism * math.sqrt(1.0 + 0.25 * math.log1p((1.0 / variances).sum()))
         scores = (self._means * rows).sum(axis=1) - self._costs + optimism * deviations
-        propensities = probability_of_best(scores, self.chance * deviations, gauss_hermite())
+        propensities = probability_of_best(scores, self.chance * deviations)
         index = int(self._generator.choice(len(self.policies), p=propensities))
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 

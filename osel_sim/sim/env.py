@@ -2,18 +2,23 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.formats.task_file import TaskSpec, load_task_file
-from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM, Observation
+from osel_sim.interface.environment import EnvironmentSpec
+from osel_sim.interface.policy import Observation
 from osel_sim.sim import predicates
 from osel_sim.sim.instance import Instance, make_instance
 from osel_sim.sim.robots import with_robot
+from osel_sim.sim.specification import ACTION_DIM, CONTROL_HZ, STATE_DIM, specification
 from osel_sim.sim.world import Snapshot, World
+
+if TYPE_CHECKING:
+    from osel_sim.sim.expert import Expert
 
 WAITING = 0.0
 """A gripper command of 0 leaves the fingers as they are (only the sign counts)."""
@@ -104,7 +109,12 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         """Give the GL contexts back."""
         self._images.close()
 
-    # -- what the episode loop uses ------------------------------------------------------------------------------------
+    # -- osel_sim.interface.environment: what the episode loop uses ----------------------------------------------------
+
+    @property
+    def specification(self) -> EnvironmentSpec:
+        """What it offers a policy."""
+        return specification(self.task.robot, self.task.horizon)
 
     def load(self, instance: Instance) -> None:
         """Reset to an instance."""
@@ -151,6 +161,12 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         """Success, or the horizon is reached."""
         return self.steps >= self.task.horizon or self.success
 
+    def expert(self) -> "Expert":
+        """The scripted expert, at the beginning of its plan for the loaded instance."""
+        from osel_sim.sim.expert import Expert
+
+        return Expert(self.world)
+
     def entity_positions(self) -> dict[str, NDArray[np.float64]]:
         """World position (3,) of everything in the scene, of its handle where it has one: labels for training, never shown to a policy."""
         return {placement.entity: self.world.landmark(placement.entity).copy() for placement in self.instance.placements}
@@ -160,16 +176,6 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         from osel_sim.sim.cameras import project
 
         return project(self.world.model, self.world.data, points, self._camera(camera), size)
-
-    def camera_pose(self, camera: str, relative_to_gripper: bool) -> dict[str, Any]:
-        """Where a camera is (`osel_sim.training.projection.Pinhole` says what the entries mean)."""
-        index = self._camera(camera)
-        position, rotation = self.world.data.cam_xpos[index], self.world.data.cam_xmat[index].reshape(3, 3)
-        if relative_to_gripper:
-            turn = self.world.grip_matrix.T
-            position, rotation = turn @ (position - self.world.grip_position), turn @ rotation
-        mount = "gripper" if relative_to_gripper else "world"
-        return {"mount": mount, "position": position.tolist(), "rotation": rotation.tolist(), "fovy": float(self.world.model.cam_fovy[index])}
 
     def snapshot(self) -> EnvSnapshot:
         """The state now; `restore` goes on from it to the same bits."""

@@ -87,10 +87,12 @@ class Expert:
     def grasp(self, thing: str) -> tuple[Array, bool]:
         """Close until both fingers hold the thing firmly."""
         world = self.world
-        if float(np.linalg.norm(world.grasp_point(thing) - world.grip_position)) > 0.05:
+        off = float(np.linalg.norm(world.grasp_point(thing) - world.grip_position))
+        if off > 0.05:
             return self._again(thing)
         held = all(world.touches(finger, thing) for finger in ("left", "right"))
-        return self.towards(world.grasp_point(thing), self._grasp_yaw(thing), CLOSED, self._lean(thing)), held and world.gripper_command > 0.5
+        gripper = OPEN if world.gripper_command < -0.9 and off > world.robot.centred else CLOSED
+        return self.towards(world.grasp_point(thing), self._grasp_yaw(thing), gripper, self._lean(thing)), held and world.gripper_command > 0.5
 
     def lift(self, thing: str) -> tuple[Array, bool]:
         """Straight up to travelling height."""
@@ -166,7 +168,7 @@ class Expert:
         target = world.grasp_point(button)
         offset = target - world.grip_position
         sideways = float(np.hypot(offset[0], offset[1]))
-        height = -0.03 if sideways < 0.012 else HOVER * min(1.0, sideways * 8.0)
+        height = -0.03 if sideways < 0.012 else HOVER * min(1.0, sideways * 8.0) + world.robot.gripper.tip
         return self.towards(target + np.array([0.0, 0.0, height]), 0.0, CLOSED), world.opening(button) > 0.9
 
     # -- helpers -------------------------------------------------------------------------------------------------------

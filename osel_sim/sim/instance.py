@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from osel_sim.core.errors import UsageError
+from osel_sim.formats.catalogue import Entity
 from osel_sim.formats.levels import instance_key, label, resolve, split_off
-from osel_sim.formats.task_file import ATTRIBUTE, Entity, TaskSpec
+from osel_sim.formats.task_file import TaskSpec
+from osel_sim.formats.terms import ATTRIBUTE
 from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.sim.perturbation import CLEAN, HELD_OUT, MORE_DISTRACTORS, Perturbation, draw, widen
 from osel_sim.sim.robots import load_robot

@@ -4,7 +4,6 @@ Decimated once with fast-simplification and kept in the user's cache folder. Mes
 same to the last bit; where a robot shows such a mesh as well, what it shows becomes a mesh of its own.
 """
 
-import hashlib
 import os
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core.arrays import read_arrays
 from osel_sim.core.errors import DataError
-from osel_sim.core.files import atomic
+from osel_sim.core.files import atomic, content_digest
 from osel_sim.interface.robot import LightMeshes
 
 ROBOT = ("robot0_", "gripper0_", "fixed_mount0_")
@@ -41,7 +40,7 @@ def lighten(spec: Any, xml: str, how: LightMeshes) -> None:
     import robosuite
 
     made_of = f"{how.keep} {how.fewest} {how.most} {how.join} {mujoco.__version__} {robosuite.__version__} {SHOWN} {xml}"
-    file = cache_folder() / f"light_meshes_{hashlib.sha256(made_of.encode()).hexdigest()[:16]}.npz"
+    file = cache_folder() / f"light_meshes_{content_digest(made_of)[:16]}.npz"
     light = _load(file)
     if light is None:
         light = _make(mujoco.MjModel.from_xml_string(xml), how)

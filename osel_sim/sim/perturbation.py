@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from osel_sim.formats.task_file import Region
+from osel_sim.formats.task_schema import Region
 from osel_sim.interface.robot import Robot
 
 type Triple = tuple[float, float, float]

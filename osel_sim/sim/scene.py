@@ -11,7 +11,7 @@ from typing import Any
 
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError
-from osel_sim.formats.task_file import Entity
+from osel_sim.formats.catalogue import Entity
 from osel_sim.interface.robot import Robot
 
 TABLE_HEIGHT = 0.8
@@ -84,7 +84,7 @@ def _compose(entities: tuple[Entity, ...], robot: Robot) -> tuple[str, dict[str,
     arm.add_gripper(gripper, arm.eef_name["right"])
     x, y, z = arm.base_xpos_offset["table"](TABLE_SIZE[0])
     arm.set_base_xpos((x + robot.nearer, y, z))
-    _mount_camera(arm, robot)
+    mount_camera(arm, robot)
     arena = TableArena(table_full_size=TABLE_SIZE, table_offset=(0, 0, TABLE_HEIGHT))
     arena.set_origin([0, 0, 0])
     arena.table_visual.set("rgba", TABLE_COLOUR)  # the white plate would vanish on robosuite's white table
@@ -101,8 +101,8 @@ def _attribute(location: str) -> Any:
     return getattr(import_module(module), name)
 
 
-def _mount_camera(arm: Any, robot: Robot) -> None:
-    """Move the wrist camera to where the robot's file has it."""
+def mount_camera(arm: Any, robot: Robot) -> None:
+    """Move the wrist camera of an arm of robosuite to where the robot's file has it."""
     mount = robot.wrist_camera
     camera = next(camera for camera in arm.root.iter("camera") if camera.get("name") == mount.name)
     for key, value in (("pos", mount.position), ("quat", mount.quaternion)):

@@ -20,7 +20,7 @@ from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic, content_digest, is_partial, read_json
 from osel_sim.core.progress import progress as progress_bar
-from osel_sim.interface.policy import ACTION_DIM, STATE_DIM
+from osel_sim.sim.specification import ACTION_DIM, STATE_DIM
 from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations
 
 IMAGES = "observation.images."

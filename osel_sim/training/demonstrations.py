@@ -16,12 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.files import read_json, write_text
-from osel_sim.formats.run_config import robots_said
 from osel_sim.formats.task_file import TaskSpec
-from osel_sim.interface.policy import ACTION_DIM, CONTROL_HZ, STATE_DIM
 from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.sim.specification import ACTION_DIM, CAMERAS, CONTROL_HZ, STATE_DIM
 
-CAMERAS = ("agentview", "wrist")
 BURST_PROBABILITY = 0.04
 """Chance that a burst of noise starts at a step."""
 BURST_STEPS = (4, 10)
@@ -75,7 +73,7 @@ def side_file(task: TaskSpec, levels: tuple[int, ...], axes: Mapping[str, int], 
     return {
         "task": task.name,
         "task_version": task.version,
-        **robots_said([task]),
+        **({} if task.robot == DEFAULT_ROBOT else {"robot": task.robot}),
         "levels": list(levels),
         "axes": dict(axes),
         "split": "train",

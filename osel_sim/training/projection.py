@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-OUT_OF_VIEW = 2.0
-"""Column and row of what a camera does not see, in a dataset: a LeRobotDataset's statistics would not survive NaN."""
-
 
 @dataclass(frozen=True)
 class Pinhole:
@@ -59,16 +56,3 @@ class Pinhole:
         places[hidden] = np.nan
         result: NDArray[np.float32] = places.astype(np.float32)
         return result
-
-
-def places_in_view(pose: dict[str, Any], points: NDArray[np.float32], state: NDArray[np.float32]) -> NDArray[np.float32]:
-    """What `annotation.places.<camera>` holds for one frame: column and row of each point, one point after the other, (2 * N,).
-
-    Args:
-        pose: the camera's, as it is in this frame (`TaskEnv.camera_pose`).
-        points: (N, 3), world.
-        state: (8,).
-    """
-    places = Pinhole.from_dict(pose).places(points[None], state[None])[0]
-    flat: NDArray[np.float32] = np.nan_to_num(places, nan=OUT_OF_VIEW).reshape(-1)
-    return flat

@@ -1,118 +1,120 @@
 """A training recipe: the sizes of a policy and how it is trained; one TOML file in policies/training/ for each policy trained here."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, field, fields
+from dataclasses import dataclass as plain_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic.dataclasses import dataclass
 
 from osel_sim.core import content
 from osel_sim.core.errors import UnknownNameError
-from osel_sim.formats.validate import Table
+from osel_sim.formats.toml_file import load_toml
+from osel_sim.formats.toml_types import TABLE, Texts, Version, at_least, between
+from osel_sim.training.model_sizes import ModelSizes
 
-_CHUNK = {"chunk_size": (1, 200), "image_size": (16, 512)}
-_PERCEPTION = {
-    "stem_channels": (4, 512),
-    "channels": (8, 1024),
-    "trunk_layers": (0, 16),
-    "query_dim": (4, 1024),
-    "queries": (1, 16),
-    "vocabulary": (64, 1_000_000),
-    "text_length": (4, 256),
-    "text_dim": (8, 1024),
-    "text_layers": (0, 12),
-}
-_HEAD = {"hidden": (16, 8192), "hidden_layers": (0, 32)}
-MODELS: dict[str, dict[str, tuple[int, int]]] = {
-    "language_chunk": {**_CHUNK, **_PERCEPTION, **_HEAD, "keypoints": (1, 512)},
-    "octo_chunk": {
-        **_CHUNK,
-        **_PERCEPTION,
-        **_HEAD,
-        "patch": (1, 64),
-        "width": (16, 4096),
-        "layers": (1, 48),
-        "attention_heads": (1, 64),
-        "readouts": (1, 64),
-        "integration_steps": (1, 100),
-        "flow_samples": (1, 64),
-    },
-    "act": {
-        **_CHUNK,
-        **_PERCEPTION,
-        "keypoints": (1, 512),
-        "dim_model": (16, 4096),
-        "n_heads": (1, 64),
-        "dim_feedforward": (16, 16384),
-        "n_encoder_layers": (1, 48),
-        "n_decoder_layers": (1, 48),
-    },
-}
-"""Types of models, and for each the sizes a recipe may set: key -> (lowest, highest). Defaults are those of the type's configuration
-(ACT's perception: of PerceptionConfig)."""
+Count = Annotated[int, at_least(0)]
+Positive = Annotated[int, at_least(1)]
+Amount = Annotated[float, between(0.0, 1e6)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=TABLE)
 class Optimisation:
-    """AdamW with warm-up, cosine decay, gradient clipping and an exponential moving average (EMA) of the weights, which is what is saved.
+    """AdamW with warm-up, cosine decay, gradient clipping and an exponential moving average (EMA) of the weights, which is what is saved."""
 
-    ACT's own loss counts all numbers of an action alike: `gripper_weight` is the others'.
-    """
+    steps: Positive = 8000
+    """Optimiser steps."""
+    batch_size: Positive = 64
+    """Samples a step."""
+    learning_rate: Amount = 1e-3
+    """Highest learning rate, after the warm-up."""
+    weight_decay: Amount = 1e-3
+    """AdamW's weight decay."""
+    warmup_steps: Count = 200
+    """Steps in which the learning rate rises."""
+    gradient_clip: Amount = 1.0
+    """Largest norm of the gradient."""
+    ema_decay: Amount = 0.998
+    """Decay of the moving average of the weights."""
+    gripper_weight: Amount = 0.5
+    """Weight of the gripper in the loss, the six motions having 1; not for ACT, whose own loss counts all numbers of an action alike."""
+    grounding_weight: Amount = 0.5
+    """Weight of the losses of the positions of the things that an instruction names."""
+    grounding_pairs: Count = 1
+    """Further pairs of an image and an instruction a sample, for those losses."""
 
-    steps: int = 8000
-    batch_size: int = 64
-    learning_rate: float = 1e-3
-    weight_decay: float = 1e-3
-    warmup_steps: int = 200
-    gradient_clip: float = 1.0
-    ema_decay: float = 0.998
-    gripper_weight: float = 0.5
-    grounding_weight: float = 0.5
-    grounding_pairs: int = 1
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=TABLE)
 class Augmentation:
     """Random changes of each training sample.
-
-    Attributes:
-        shift: images move by up to so many pixels each way, all cameras of a sample alike.
-        brightness, contrast, colour: spread of the added brightness, of the common gain and of each channel's own gain (images in [0, 1]).
-        state_noise: standard deviation added to the normalised state.
-        state_dropout: share of samples whose whole state is hidden (set to its mean).
-        rephrase: share of samples whose instruction is replaced by another training phrasing of the same targets.
-        drop_word, noise_word: share of a phrasing's words (never of a name) left out, or replaced by a made-up word, so that words never
-            seen in training are no reason to fail.
-        insert_words: up to so many words, made up or of the dataset's phrasings, are put in between those of a phrasing. Without them nothing
-            is learned about places in a text beyond the longest phrasing, and long instructions fail whatever they say.
-        shuffle_words: share of phrasings whose words come in random order, where the things named are of different kinds; where they are of
-            one kind, order is meaning.
 
     The changes of words are those of Wei & Zou (2019), "EDA: Easy Data Augmentation", without its thesaurus.
     """
 
-    shift: int = 4
-    brightness: float = 0.1
-    contrast: float = 0.15
-    colour: float = 0.05
-    state_noise: float = 0.02
-    state_dropout: float = 0.0
-    rephrase: float = 0.8
-    drop_word: float = 0.15
-    noise_word: float = 0.15
-    insert_words: int = 0
-    shuffle_words: float = 0.0
+    shift: Count = 4
+    """Images move by up to so many pixels each way, all cameras of a sample alike."""
+    brightness: Amount = 0.1
+    """Spread of the added brightness (images in [0, 1])."""
+    contrast: Amount = 0.15
+    """Spread of the common gain."""
+    colour: Amount = 0.05
+    """Spread of each channel's own gain."""
+    state_noise: Amount = 0.02
+    """Standard deviation added to the normalised state."""
+    state_dropout: Amount = 0.0
+    """Share of samples whose whole state is hidden (set to its mean)."""
+    rephrase: Amount = 0.8
+    """Share of samples whose instruction is replaced by another training phrasing of the same targets."""
+    drop_word: Amount = 0.15
+    """Share of a phrasing's words (never of a name) left out."""
+    noise_word: Amount = 0.15
+    """Share of a phrasing's words replaced by a made-up word, so that words never seen in training are no reason to fail."""
+    insert_words: Count = 0
+    """Up to so many words, made up or of the dataset's phrasings, are put in between those of a phrasing. Without them nothing is learned about
+    places in a text beyond the longest phrasing, and long instructions fail whatever they say."""
+    shuffle_words: Amount = 0.0
+    """Share of phrasings whose words come in random order, where the things named are of different kinds; where they are of one kind, order is
+    meaning."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class DataTable:
+    """Which demonstrations are used."""
+
+    tasks: Texts | None = None
+    """Only datasets of these tasks are used; left out: all that are given."""
+    weights: dict[str, Annotated[float, between(0.001, 1000.0)]] = field(default_factory=dict)
+    """Task -> its share of the samples; tasks that are not named have a weight of 1."""
+    episodes: Annotated[int, between(1, 10_000_000)] | None = None
+    """Only the first so many training episodes of each dataset are used; left out: all."""
+    validation_episodes: Annotated[int, between(0, 100_000)] = 20
+    """Held out, the last ones of each dataset."""
+
+
+@dataclass(frozen=True, kw_only=True, config=TABLE)
+class RecipeFile:
+    """How a policy is trained: one file in policies/training/."""
+
+    version: Version
+    """Of the format."""
+    model: ModelSizes
+    """The type of model and its sizes; those left out are as the type's configuration has them."""
+    data: DataTable = field(default_factory=DataTable)
+    """Which demonstrations are used."""
+    optimisation: Optimisation = field(default_factory=Optimisation)
+    """How the weights are found."""
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    """Random changes of each training sample."""
+
+
+@plain_dataclass(frozen=True)
 class Recipe:
-    """One recipe, validated.
+    """One recipe as `training.json` has it, with the keys of `[data]` among the others and the type beside the sizes.
 
     Attributes:
-        type: a LeRobot policy type, one of `MODELS`.
+        type: a LeRobot policy type.
         model: sizes, keyword arguments of the type's configuration.
-        tasks: only datasets of these tasks are used; None: all that are given.
-        weights: task -> its share of the samples; tasks that are not named have a weight of 1.
-        episodes: only the first so many training episodes of each dataset are used; None: all.
-        validation_episodes: held out, the last ones of each dataset.
+        tasks, weights, episodes, validation_episodes: as `DataTable` explains them.
     """
 
     type: str
@@ -149,42 +151,16 @@ def load_recipe(file: Path) -> Recipe:
     Raises:
         ContentError: naming the file, the key and what would be right.
     """
-    table = Table.load(file)
-    table.integer("version", 1, 1)
-    model = table.table("model")
-    kind = model.choice("type", tuple(MODELS))
-    sizes = {key: model.integer(key, low, high) for key, (low, high) in MODELS[kind].items() if key in model.data}
-    model.done()
-    data = table.table("data", {})
-    episodes = data.integer("episodes", 1, 10_000_000) if "episodes" in data.data else None
-    validation = data.integer("validation_episodes", 0, 100_000, 20)
-    tasks = data.strings("tasks") if "tasks" in data.data else None
-    shares = data.table("weights", {})
-    weights = {task: shares.number(task, 0.001, 1000.0) for task in shares.data}
-    data.done()
-    recipe = Recipe(
-        type=kind,
-        model=sizes,
-        tasks=tasks,
-        weights=weights,
-        episodes=episodes,
-        validation_episodes=validation,
-        optimisation=_numbers(table.table("optimisation", {}), Optimisation),
-        augmentation=_numbers(table.table("augmentation", {}), Augmentation),
+    found = load_toml(RecipeFile, file)
+    sizes = {size.name: getattr(found.model, size.name) for size in fields(found.model) if size.name != "type"}
+    return Recipe(
+        type=found.model.type,
+        model={name: size for name, size in sizes.items() if size is not None},
+        tasks=found.data.tasks,
+        weights=found.data.weights,
+        episodes=found.data.episodes,
+        validation_episodes=found.data.validation_episodes,
+        optimisation=found.optimisation,
+        augmentation=found.augmentation,
         file=file,
     )
-    table.done()
-    return recipe
-
-
-def _numbers[T: (Optimisation, Augmentation)](table: Table, kind: type[T]) -> T:
-    """A dataclass of non-negative numbers from a table that may leave any out."""
-    values: dict[str, Any] = {}
-    for field in fields(kind):
-        if isinstance(field.default, int):
-            lowest = 1 if field.name in ("steps", "batch_size") else 0
-            values[field.name] = table.integer(field.name, lowest, 100_000_000, field.default)
-        else:
-            values[field.name] = table.number(field.name, 0.0, 1e6, field.default)
-    table.done()
-    return kind(**values)

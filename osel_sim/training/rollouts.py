@@ -18,22 +18,19 @@ def success_rate(spec: PolicySpec, checkpoint: Path, task: str, episodes: int, s
     Raises:
         PolicyError: an episode ended as an error, which is no failure of the policy.
     """
-    from osel_sim.core import content
     from osel_sim.episodes.loop import Driver, run_episode
-    from osel_sim.formats.task_file import load_task_file
     from osel_sim.policy.local import LocalCaller
     from osel_sim.policy.registry import make_policy
-    from osel_sim.sim.env import TaskEnv
-    from osel_sim.sim.instance import make_instance
+    from osel_sim.suites.registry import find_task
 
+    found = find_task(task, tasks)
     local = dataclasses.replace(spec, checkpoint=str(checkpoint.resolve()), remote=None, inference_seconds=0.0)
-    driver = Driver(local, LocalCaller(make_policy(local), local))
-    task_spec = load_task_file(content.find("tasks", task, tasks))
-    env = TaskEnv(task_spec)
+    driver = Driver(local, LocalCaller(make_policy(local, found.specification), local, found.specification))
+    env = found.open()
     solved = 0
     try:
         for index in range(episodes):
-            scene = make_instance(task_spec, seed + index, 0, "validation")
+            scene = found.instance(seed + index, 0, "validation")
             env.load(scene)
             outcome = run_episode(env, scene, driver)
             if outcome.error is not None:

@@ -2,10 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib import import_module
-from importlib.metadata import entry_points
 
 from osel_sim.core.errors import ContentError, UnknownNameError, UsageError
+from osel_sim.core.registry import Registry
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.robot import Robot
 
@@ -18,10 +17,7 @@ BUILT_IN = {
     "UR5e": "osel_sim.sim.robots.ur5e:UR5E",
 }
 
-
-def robot_locations() -> dict[str, str]:
-    """Name -> `module:attribute` of every robot, installed plugins included; a plugin cannot replace a built-in one."""
-    return {point.name: point.value for point in entry_points(group=ENTRY_POINTS)} | BUILT_IN
+ROBOTS = Registry("robot", ENTRY_POINTS, BUILT_IN, Robot)
 
 
 def load_robot(name: str) -> Robot:
@@ -31,13 +27,9 @@ def load_robot(name: str) -> Robot:
         UnknownNameError: with the nearest known name.
         UsageError: what a plugin names is no such robot.
     """
-    locations = robot_locations()
-    if name not in locations:
-        raise UnknownNameError("robot", name, locations)
-    module, _, attribute = locations[name].partition(":")
-    robot = getattr(import_module(module), attribute)
-    if not isinstance(robot, Robot) or robot.name != name:
-        raise UsageError(f"{locations[name]}, which the entry point {name!r} of {ENTRY_POINTS} names, must be a Robot of that name, got {robot!r}")
+    robot = ROBOTS.load(name)
+    if robot.name != name:
+        raise UsageError(f"{ROBOTS.locations()[name]}, which the entry point {name!r} of {ENTRY_POINTS} names, calls itself {robot.name!r}")
     return robot
 
 

@@ -11,5 +11,6 @@ KINOVA3 = Robot(
     start_weights=(1.0, 1.0, 1.0, 1.0, 1.5, 1.5, 2.0),
     start_lift=(0.0, -0.336, 0.0, -0.174, 0.0, 0.0, 0.0),
     lowering=0.4,
+    centred=0.005,
     gripper=ROBOTIQ_85,
 )

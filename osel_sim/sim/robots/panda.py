@@ -2,7 +2,7 @@
 
 import math
 
-from osel_sim.interface.robot import Gripper, LightMeshes, Robot
+from osel_sim.interface.robot import Gripper, Robot
 
 PANDA = Robot(
     name="Panda",
@@ -10,7 +10,6 @@ PANDA = Robot(
     home=(0.0, math.pi / 16.0, 0.0, -math.pi / 2.0 - math.pi / 3.0, 0.0, math.pi - 0.2, math.pi / 4.0),
     start_weights=(1.0, 1.0, 1.0, 1.0, 1.5, 1.5, 2.0),  # the wrist's joints move the hand less
     start_lift=(0.0, -0.457, 0.0, 0.315, 0.0, 0.113, 0.0),
-    meshes=LightMeshes(join=(0.06,)),  # as its images have always been
     gripper=Gripper(
         model="robosuite.models.grippers:PandaGripper",
         rest=(0.04, -0.04),

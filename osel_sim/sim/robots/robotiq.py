@@ -17,6 +17,10 @@ ARMATURE, DAMPING = 0.005, 0.1
 """Of each joint, kg m^2 and N m s; robosuite has none, and its stiff drives then swing on for ever."""
 
 
+FRICTION = "2 0.05 0.0001"
+"""Of the pads: what robosuite gives the Panda's, its own rubber; with the usual friction round things roll out."""
+
+
 def _finger(side: str) -> tuple[str, ...]:
     return tuple(f"{PREFIX}{side}_{part}_collision" for part in ("outer_finger", "inner_finger", "fingertip", "fingerpad"))
 
@@ -28,6 +32,9 @@ def tighten(model: Any) -> None:
     for joint in model.worldbody.iter("joint"):
         joint.set("armature", str(ARMATURE))
         joint.set("damping", str(DAMPING))
+    for geom in model.worldbody.iter("geom"):
+        if geom.get("name", "").endswith(("fingertip_collision", "fingerpad_collision")):
+            geom.set("friction", FRICTION)
     for side, driven in DRIVEN.items():
         for follower, ratio in FOLLOWERS.items():
             model.equality.append(Element("joint", joint1=f"{PREFIX}{side}_{follower}", joint2=PREFIX + driven, polycoef=f"0 {ratio} 0 0 0"))
@@ -42,5 +49,6 @@ ROBOTIQ_85 = Gripper(
     left=_finger("left"),
     right=_finger("right"),
     pads=(f"{PREFIX}left_fingerpad_collision", f"{PREFIX}right_fingerpad_collision"),
+    tip=0.01,
     prepare=tighten,
 )

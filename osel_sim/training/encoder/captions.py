@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.formats.task_file import ATTRIBUTE, TaskSpec
-from osel_sim.formats.terms import KINDS
+from osel_sim.formats.task_file import TaskSpec
+from osel_sim.formats.terms import ATTRIBUTE, KINDS
 
 EDGE = 0.04
 """A thing whose middle is nearer than this to the edge of a view (fraction of its side) is neither surely in it nor surely out."""

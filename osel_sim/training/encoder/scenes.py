@@ -14,8 +14,7 @@ from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic
 from osel_sim.core.progress import progress
 from osel_sim.formats.task_file import TaskSpec
-
-CAMERA = "agentview"
+from osel_sim.sim.specification import CONTEXT_CAMERA as CAMERA
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What the columns of somebody's outcome table mean: a mapping, from a TOML file (mapping_file) or from the command line.
+"""What the columns of somebody's outcome table mean, from a mapping file (TOML, columns_file) or from the command line.
 
     version = 1
     name = "mmlu"
@@ -29,54 +29,71 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
-Duplicates = Literal["refuse", "drop", "repeats", "keep"]
-Count = Literal["value", "characters", "words"]
+from pydantic import AfterValidator
+from pydantic.dataclasses import dataclass as pydantic_dataclass
+
+from osel_sim.formats.toml_types import TABLE, OneOf, Texts, between
+
+DUPLICATES = ("refuse", "drop", "repeats", "keep")
+COUNTS = ("value", "characters", "words")
 
 NUMBERS = ("score", "subgoals", "steps", "upload", "inference", "download", "motion", "price")
-"""What a mapping may give for each policy besides success, by the log's names."""
+"""What may be given for each policy besides success, by the log's names."""
 VALUES = ("success", "score", "subgoals", "steps", "seconds", "upload", "inference", "download", "motion", "price", "error")
-"""Keys of each policy in a mapping, each of them a flag as well."""
+"""Keys of each policy, each of them a flag as well."""
 LABELS = ("split", "phrasing", "target", "container")
 COMMAND_LINE = "command line"
-"""What a mapping made of flags has in place of its file."""
+"""What stands in place of the file where the columns' meaning is made of flags."""
 _FLAGS = {"instance.images": "--image", "outcome.policy": "--policy-column", "outcome.repeat": "--repeat-column"}
 """Flags that are not called what their key is called."""
 FIELD = re.compile(r"\{([^{}]+)\}")
 """A column's name in a template."""
+PLACE = "{policy}"
+"""Stands for a policy's name in what holds for all policies."""
 
 
-@dataclass(frozen=True)
+def _one_or_more(files: Texts) -> Texts:
+    if not files:
+        raise ValueError("must name at least one file")
+    return files
+
+
+Files = Annotated[Texts, AfterValidator(_one_or_more)]
+Factor = Annotated[float, between(-1e12, 1e12)]
+
+
+@pydantic_dataclass(frozen=True, config=TABLE)
 class Term:
-    """A number for every row: scale * (column, or its length) / divide + offset, or only the offset where there is no column.
-
-    Attributes:
-        count: the column's value, or how many characters or words it has (for a price by tokens where only the text is there).
-        divide: a column to divide by, such as the number of subgoals there are.
-    """
-
-    column: str | None = None
-    count: Count = "value"
-    scale: float = 1.0
-    divide: str | None = None
-    offset: float = 0.0
-
-
-@dataclass(frozen=True)
-class Success:
-    """Success for every row: a column of true and false, of words that mean these, or of numbers with a threshold.
-
-    Attributes:
-        at_least: success is a number of so much or more; None where the column has true and false, or 1 and 0.
-        true, false: words that mean success and failure; empty where the column has true and false.
-    """
+    """A number for every row: scale * (column, or its length) / divide + offset."""
 
     column: str
-    at_least: float | None = None
+    """The column."""
+    count: Annotated[str, OneOf(COUNTS)] = "value"
+    """The column's value, or how many characters or words it has (for a price by tokens where only the text is there)."""
+    scale: Factor = 1.0
+    """What the value is multiplied by."""
     divide: str | None = None
-    true: tuple[str, ...] = ()
-    false: tuple[str, ...] = ()
+    """A column to divide by, such as the number of subgoals there are."""
+    offset: Factor = 0.0
+    """What is added."""
+
+
+@pydantic_dataclass(frozen=True, config=TABLE)
+class Success:
+    """Success for every row: a column of true and false, of words that mean these, or of numbers with a threshold."""
+
+    column: str
+    """The column."""
+    at_least: Factor | None = None
+    """Success is a number of so much or more; left out where the column has true and false, or 1 and 0."""
+    divide: str | None = None
+    """A column to divide by, before it is held against `at_least`."""
+    true: Texts = ()
+    """Words that mean success."""
+    false: Texts = ()
+    """Words that mean failure."""
 
 
 @dataclass(frozen=True)
@@ -85,23 +102,23 @@ class PolicyColumns:
 
     Attributes:
         name: in the log.
-        numbers: name in the log -> the terms whose sum it is.
+        numbers: name in the log -> the terms whose sum it is: columns, and numbers that hold for every row.
         error: column that says why there is no valid outcome; empty where there is one.
-        total: the mapping gives `inference` as `seconds`, the total.
+        total: `inference` is given as `seconds`, the total.
     """
 
     name: str
     success: Success
-    numbers: dict[str, tuple[Term, ...]]
+    numbers: dict[str, tuple[Term | float, ...]]
     error: str | None = None
     total: bool = False
 
     @property
-    def columns(self) -> dict[str, str]:
-        """All columns it needs -> what they are needed for, as the mapping calls it."""
+    def needed(self) -> dict[str, str]:
+        """All columns it needs -> the key that asks for them."""
         needed: list[tuple[str | None, str]] = [(self.success.column, "success"), (self.success.divide, "success"), (self.error, "error")]
         for name, terms in self.numbers.items():
-            needed += [(column, self.called(name)) for term in terms for column in (term.column, term.divide)]
+            needed += [(column, self.called(name)) for term in terms if isinstance(term, Term) for column in (term.column, term.divide)]
         columns: dict[str, str] = {}
         for column, name in needed:
             if column is not None:
@@ -109,21 +126,23 @@ class PolicyColumns:
         return columns
 
     def called(self, number: str) -> str:
-        """What the mapping calls a number of the log."""
+        """The key that gives a number of the log."""
         return "seconds" if number == "inference" and self.total else number
 
 
-@dataclass(frozen=True)
+@pydantic_dataclass(frozen=True, kw_only=True, config=TABLE)
 class Join:
     """Another table: one row for every value of the column `on`."""
 
-    files: tuple[str, ...]
+    files: Files
+    """Its files, relative to this one; as `table.files`."""
     on: str
+    """Column that both tables have."""
 
 
 @dataclass(frozen=True)
-class Mapping:
-    """A mapping, validated.
+class Columns:
+    """What the columns of a table mean, with what holds for all policies written out for each.
 
     Attributes:
         file: the TOML file, or `COMMAND_LINE`.
@@ -151,7 +170,7 @@ class Mapping:
     group: str | None
     key: str | None
     labels: dict[str, str]
-    duplicates: Duplicates
+    duplicates: str
     policy: str | None
     repeat: str | None
     policies: dict[str, PolicyColumns] = field(default_factory=dict)
@@ -163,7 +182,7 @@ class Mapping:
         return self.file == COMMAND_LINE
 
     @property
-    def columns(self) -> dict[str, str]:
+    def needed(self) -> dict[str, str]:
         """Columns it needs -> the key that asks for them."""
         needed = {name: "instance.text" for name in FIELD.findall(self.text)}
         needed |= {name: "instance.images" for name in self.images}
@@ -177,14 +196,14 @@ class Mapping:
             if column is not None:
                 needed[column] = key
         for name, policy in self.policies.items():
-            needed |= {column: f"policies.{name}.{key}" for column, key in policy.columns.items()}
+            needed |= {column: f"policies.{name}.{key}" for column, key in policy.needed.items()}
         if self.default is not None:
-            needed |= {column: f"outcome.{key}" for column, key in self.default.columns.items()}
+            needed |= {column: f"outcome.{key}" for column, key in self.default.needed.items()}
         return needed
 
 
 def flag(key: str) -> str:
-    """The flag that stands for a mapping's key: `--text` for `instance.text`, `--price of policy 'large'` for `policies.large.price`."""
+    """The flag that stands for a key: `--text` for `instance.text`, `--price of policy 'large'` for `policies.large.price`."""
     section, _, rest = key.partition(".")
     policy, _, value = rest.rpartition(".")
     if value == "at_least":
@@ -194,7 +213,7 @@ def flag(key: str) -> str:
 
 
 def threshold(from_flags: bool) -> str:
-    """How a mapping says that a number is success from somewhere on, for error messages."""
+    """How to say that a number is success from somewhere on, for error messages."""
     return "--success COLUMN --at-least X" if from_flags else "success = { column = ..., at_least = ... }"
 
 

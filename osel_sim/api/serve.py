@@ -1,0 +1,96 @@
+"""A policy over WebSocket."""
+
+import json
+import os
+import secrets
+import threading
+from typing import TYPE_CHECKING, Annotated
+
+from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
+from osel_sim.core.errors import SettingError, UsageError
+from osel_sim.core.trust import trusting
+from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
+from osel_sim.remote.serving import run_until_signal, stop_with_stdin
+
+if TYPE_CHECKING:
+    from osel_sim.interface.environment import EnvironmentSpec
+
+
+@settings
+class ServeConfig(TrustSettings):
+    """Serve a policy over WebSocket (openpi's protocol)."""
+
+    policy: str
+    """name of a policy file; python -m osel_sim.run --list shows them"""
+    host: Annotated[str, MAIN] = "127.0.0.1"
+    """address to listen on; the default is reached from this machine only"""
+    port: Annotated[int, MAIN] = 8000
+    """port, 0 for a free one"""
+    token_env: Annotated[str, MAIN] = TOKEN_VARIABLE
+    """environment variable with the token"""
+    policies_dir: Annotated[Folder | None, CONTENT] = None
+    """folder with policy files of your own"""
+    task: Annotated[str | None, OTHER] = None
+    """a task that it will drive in, where that is none of ours: SUITE:TASK"""
+    environment: Annotated[str | None, OTHER] = None
+    """what it will drive as JSON, in place of --task (for a program that starts the server)"""
+    watch_stdin: Annotated[bool, OTHER] = False
+    """stop when standard input ends (for a program that starts the server)"""
+
+
+def serve(config: ServeConfig) -> None:
+    """Serve a policy until SIGTERM or SIGINT; one line of JSON on standard output says when it is ready.
+
+    Raises:
+        OselError: whatever is wrong with the settings, the policy file or its checkpoint; the message says what.
+    """
+    if config.watch_stdin:
+        threading.Thread(target=stop_with_stdin, daemon=True).start()
+    with trusting(config.trust):
+        _serve(config)
+
+
+def _serve(config: ServeConfig) -> None:
+    if not 0 <= config.port <= 65535:
+        raise SettingError("port", f"must lie in [0, 65535], got {config.port}")
+    from osel_sim.formats import library
+
+    spec = library.load_policy(config.policy, config.policies_dir)
+    given = os.environ.get(config.token_env)
+
+    from osel_sim.policy.registry import session_factory
+    from osel_sim.remote.server import PolicyServer, is_loopback, warm_up
+
+    if given is None and not is_loopback(config.host):
+        raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")
+    token = check_token(given) if given is not None else secrets.token_urlsafe(32)
+    environment = _environment(config)
+    greeting = Greeting.of(spec, environment)
+    make_session = session_factory(spec, environment)
+    warm_up(make_session, greeting)
+    server = PolicyServer(make_session, greeting, token, config.host, config.port)
+
+    def ready(port: int) -> None:
+        host = f"[{config.host}]" if ":" in config.host else config.host
+        line = {"policy": spec.name, "url": f"ws://{host}:{port}", "port": port}
+        print(json.dumps(line if given is not None else {**line, "token": token}), flush=True)
+
+    run_until_signal(server, ready)
+
+
+def _environment(config: ServeConfig) -> "EnvironmentSpec":
+    """What the policy will drive: as given, or as a task has it, or any of our own."""
+    from osel_sim.interface.environment import EnvironmentSpec
+
+    if config.environment is not None:
+        try:
+            return EnvironmentSpec.from_dict(json.loads(config.environment))
+        except ValueError as error:
+            raise SettingError("environment", f"is not JSON ({error})") from None
+    if config.task is not None:
+        from osel_sim.suites.registry import find_task
+
+        return find_task(config.task).specification
+    from osel_sim.sim.specification import specification
+
+    return specification()

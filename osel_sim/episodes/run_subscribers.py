@@ -1,0 +1,145 @@
+"""Subscribers of a live run: they are told of its decisions, and bring subscribers of their own to its episodes."""
+
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol, override
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.episodes.loop import Subscriber
+from osel_sim.episodes.subscribers import RealTime, Timing
+from osel_sim.episodes.video import Video
+from osel_sim.formats.journal import Decision, Lines
+
+TIMING, VIDEOS = "timing.jsonl", "videos"
+
+
+class Run(Protocol):
+    """A live run, as its subscribers see it.
+
+    Attributes:
+        folder: where it is written.
+    """
+
+    folder: Path
+
+    @property
+    def policies(self) -> Sequence[str]:
+        """Names of the policies that are chosen from."""
+        ...
+
+    @property
+    def decisions(self) -> Sequence[Decision]:
+        """All decisions so far, also those of the run's earlier processes."""
+        ...
+
+    @property
+    def rewards(self) -> NDArray[np.float64]:
+        """(decisions, policies) reward of every policy in every decision, NaN where there is none."""
+        ...
+
+
+class RunSubscriber:
+    """Is told what happens in a live run; does nothing unless overridden. It must leave the run as it found it.
+
+    An error of a subscriber ends the run; the decision at hand is made again when it is resumed.
+    """
+
+    def on_start(self, run: Run) -> None:
+        """The run begins, or goes on after the decisions that its journal has."""
+
+    def on_instance(self, index: int) -> None:
+        """A decision begins: its instance is about to be loaded."""
+
+    def on_choice(self, index: int, policy: str) -> None:
+        """The selector has chosen; no episode has begun."""
+
+    def watch(self, index: int, policy: str, chosen: bool) -> Sequence[Subscriber]:
+        """Subscribers for the coming episode of a decision.
+
+        Args:
+            chosen: whether it is the selector's choice; others run for comparison.
+        """
+        return ()
+
+    def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:
+        """A decision is made; it goes into the journal next.
+
+        Args:
+            rewards: of every policy that ran, None where an episode ended in an error.
+        """
+
+    def on_end(self, run: Run) -> None:
+        """The run is over or interrupted, and all of its files are written. Not told after an error."""
+
+    def close(self) -> None:
+        """Let go of files and of the terminal; always called, after an error too."""
+
+
+class TimingFile(RunSubscriber):
+    """Writes `timing.jsonl`: what decisions and their episodes really took on this machine."""
+
+    def __init__(self) -> None:
+        self._lines: Lines | None = None
+        self._start = self._chosen = 0.0
+        self._episodes: dict[str, Timing] = {}
+
+    @override
+    def on_start(self, run: Run) -> None:
+        self._lines = Lines(run.folder / TIMING, keep=len(run.decisions))
+
+    @override
+    def on_instance(self, index: int) -> None:
+        self._start, self._episodes = time.perf_counter(), {}
+
+    @override
+    def on_choice(self, index: int, policy: str) -> None:
+        self._chosen = time.perf_counter()
+
+    @override
+    def watch(self, index: int, policy: str, chosen: bool) -> Sequence[Subscriber]:
+        self._episodes[policy] = Timing()
+        return [self._episodes[policy]]
+
+    @override
+    def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:
+        if self._lines is not None:
+            self._lines.append(
+                {
+                    "index": decision.index,
+                    "seconds": time.perf_counter() - self._start,
+                    "context_and_choice": self._chosen - self._start,
+                    "episodes": {policy: {"seconds": timing.seconds, "calls": timing.calls} for policy, timing in self._episodes.items()},
+                }
+            )
+
+    @override
+    def close(self) -> None:
+        if self._lines is not None:
+            self._lines.close()
+
+
+class Films(RunSubscriber):
+    """Films the chosen policy's episode of some decisions into `videos/`.
+
+    Args:
+        folder: of the run.
+        indices: of the decisions.
+    """
+
+    def __init__(self, folder: Path, indices: frozenset[int]) -> None:
+        self._folder, self._indices = folder / VIDEOS, indices
+
+    @override
+    def watch(self, index: int, policy: str, chosen: bool) -> Sequence[Subscriber]:
+        return [Video(self._folder / f"{index:05d}-{policy}.mp4")] if chosen and index in self._indices else []
+
+
+class Paced(RunSubscriber):
+    """Runs the chosen policies' episodes in real time."""
+
+    @override
+    def watch(self, index: int, policy: str, chosen: bool) -> Sequence[Subscriber]:
+        return [RealTime()] if chosen else []
