@@ -96,7 +96,9 @@ class Look:
             return None
         longest = min(max(map(len, self.shown), default=1), 48)
         columns = max(1, min(len(self.shown), int(WIDE / (longest * _LETTER + 40))))
-        look: dict[str, Any] = {"symbolType": symbol, "symbolStrokeWidth": 2.5, "symbolSize": 220} if symbol == "stroke" else {}
+        look: dict[str, Any] = {"symbolType": symbol} if symbol else {}
+        if symbol == "stroke":
+            look |= {"symbolStrokeWidth": 2.5, "symbolSize": 220}
         return alt.Legend(values=self.shown, title=None, columns=columns, symbolOpacity=1, **look)
 
 
@@ -162,16 +164,17 @@ def _renumbered(svg: str) -> str:
     return re.sub(r'(id="|="url\(#)(clip\d+)', lambda found: found[1] + numbers.setdefault(found[2], f"clip{len(numbers)}"), svg)
 
 
-def numbers(values: ArrayLike) -> list[float | None]:
+def numbers(values: ArrayLike, digits: int = 4) -> list[float | None]:
     """Numbers for JSON, which has no NaN, rounded to what can be seen."""
-    return [float(f"{value:.4g}") if math.isfinite(value) else None for value in np.asarray(values, np.float64).ravel().tolist()]
+    return [float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in np.asarray(values, np.float64).ravel().tolist()]
 
 
 def unfolded(*records: Mapping[str, Any]) -> alt.Chart:
     """A chart of data of which each record holds whole columns: a fraction of the bytes of a record for each row. Marks are put on it.
 
     Args:
-        records: all of the same keys. A list is a column; anything else is the same in all rows of its record, `name` what the legend hides it by.
+        records: all of the same keys. A list is a column; anything else, a tuple too, is the same in all rows of its record, `name` what the legend
+            hides it by.
     """
     wide: list[str | alt.FieldName] = [key for key, value in records[0].items() if isinstance(value, list)]
     base = alt.Chart(alt.InlineData(values=[dict(record) for record in records]))

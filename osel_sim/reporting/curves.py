@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from osel_sim.reporting.charts import HEIGHT, Look, Panel, numbers, panel, unfolded
 from osel_sim.reporting.palette import LIGHT
 
-_HOVERED = 32
+_HOVERED = 24
 """Places along the axis at which the page tells the values of all lines."""
 
 _TOLD = 16
@@ -70,7 +70,7 @@ def curves(
     return panel(title, HEIGHT, *layers)
 
 
-def thinned(length: int, most: int = 120) -> NDArray[np.int64]:
+def thinned(length: int, most: int = 100) -> NDArray[np.int64]:
     """Which points of a long curve to draw: all of the first, then ever sparser, the last included.
 
     Args:
@@ -100,7 +100,7 @@ def _record(x: NDArray[np.float64], line: Line) -> dict[str, Any]:
     record: dict[str, Any] = {"name": line.name, "x": numbers(x), "y": numbers(line.y)}
     none: list[float | None] = [None] * len(x)
     low, high = line.low, line.high
-    return record | {"low": none if low is None else numbers(low), "high": none if high is None else numbers(high)}
+    return record | {"low": none if low is None else numbers(low, 3), "high": none if high is None else numbers(high, 3)}
 
 
 def _told(x: NDArray[np.float64], lines: Sequence[Line], x_title: str) -> alt.Chart:

@@ -123,11 +123,13 @@ def clouds(places: NDArray[np.float64], told: tuple[Sequence[str], Sequence[int]
     """
     x, y = _strewn(places).T
     record = {"x": numbers(x), "y": numbers(y), "about": list(told[0]), "instance": list(told[1])}
-    record |= {f"n{number}": list(labels) for number, (labels, _) in enumerate(aspects.values())}
+    for number, (labels, _) in enumerate(aspects.values()):
+        known = tuple(dict.fromkeys(labels))  # each label once, as what is no column
+        record |= {f"labels{number}": known, f"n{number}": [known.index(label) for label in labels]}
     bare = alt.Axis(labels=False, ticks=False, grid=False, domain=False, title=None)
     panels: list[Panel] = []
     for number, (title, (_, look)) in enumerate(aspects.items()):
-        base = unfolded(record).transform_calculate(name=f"datum.n{number}").transform_filter(SHOWN)
+        base = unfolded(record).transform_calculate(name=f"datum.labels{number}[datum.n{number}]").transform_filter(SHOWN)
         point = base.mark_point(filled=True, size=22, opacity=0.8).encode(
             x=alt.X("x:Q", axis=bare, scale=alt.Scale(zero=False)),
             y=alt.Y("y:Q", axis=bare, scale=alt.Scale(zero=False)),

@@ -16,7 +16,7 @@ from osel_sim.reporting.html_tables import digits_of, shortened
 from osel_sim.reporting.page import Episodes
 from osel_sim.selection.reward import RewardWeights
 
-MOST_EPISODES = 3_000
+MOST_EPISODES = 2_500
 """So many fit into a page of two megabytes."""
 
 MOST_LETTERS, ALL_LETTERS = 600, 300_000
@@ -73,11 +73,7 @@ def list_episodes(
         "policy": [policy for _, policy, _ in places],
         "repeat": [repeat for _, _, repeat in places],
         "success": [_number(log.success[place], 3) for place in places],
-        **{
-            name: [_number(values[place], _NUMBERS[name]) for place in places]
-            for name, values in measures.items()
-            if np.isfinite(values).any()  # a log from elsewhere may know no steps
-        },
+        **{name: [_number(values[place], _NUMBERS[name]) for place in places] for name, values in measures.items()},
         **{name: [_number(getattr(log, name)[place], _GRADED[name]) for place in places] for name in graded(log)},
         "fallback": [found.get(place, {}).get("fallback") for place in places],
         "error": [found.get(place, {}).get("error") or ("ended in error" if log.errors[place] else None) for place in places],
@@ -85,6 +81,7 @@ def list_episodes(
     }
     if chosen is not None:
         episodes["chosen"] = [int(chosen[row] == policy) for row, policy, _ in places]
+    episodes = {name: column for name, column in episodes.items() if any(value is not None for value in column)}
     data = {
         "policies": list(log.policies),
         "instances": [_instance(log, row, (scenes or {}).get(row), min(MOST_LETTERS, ALL_LETTERS // max(1, len(kept)))) for row in kept],

@@ -38,7 +38,8 @@ from osel_sim.reporting.selector_sections import (
 )
 from osel_sim.selection.reward import RewardWeights
 
-_MOST_PICKS = 4
+_MOST_PICKS, _MOST_SHOWN = 4, 3
+"""Selectors whose choices are told of each episode, and how many of the best are drawn without being asked for."""
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def _read(folder: Path, log_folder: Path | None) -> _Replay:
     streams = _streams(log, weights, choices, names)
     always = {shown: name.removeprefix("fixed:") for name, shown in names.items() if name.startswith("fixed:")}
     learnable = ORACLES[result["learnable_oracle"]["name"]]
-    keep = {*_ends(result, names), names.get(_speaker(result), ""), names.get(str(result["verdict"]["stake"].get("selector")), "")}
+    keep = {*_ends(result, names), *(names[name] for name in _learners(result)[:_MOST_SHOWN])}
     look = look_of(list(streams), log.policies, always, keep, learnable)
     return _Replay(folder, result, choices, log, weights, names, streams, look, learnable)
 
@@ -144,11 +145,14 @@ def _page(replay: _Replay, scenes: Scenes) -> Page:
 
 def _speaker(result: Mapping[str, Any]) -> str:
     """The selector that the verdict is about; where it names none, the best one that learns; empty where none does."""
-    found = result["verdict"].get("selector") or result["verdict"]["stake"].get("selector")
-    learners = [name for name, entry in result["selectors"].items() if entry["kind"] == "learner"]
-    if found in learners or not learners:
-        return str(found or "")
-    return str(max(learners, key=lambda name: float(result["selectors"][name]["mean_reward"])))
+    found, learners = result["verdict"].get("selector") or result["verdict"]["stake"].get("selector"), _learners(result)
+    return str(found or "") if found in learners or not learners else learners[0]
+
+
+def _learners(result: Mapping[str, Any]) -> list[str]:
+    """Selectors that learn, the best first."""
+    entries = result["selectors"]
+    return sorted((name for name in entries if entries[name]["kind"] == "learner"), key=lambda name: -float(entries[name]["mean_reward"]))
 
 
 def _chosen(choices: Choices, who: str, names: Mapping[str, str]) -> Chosen:

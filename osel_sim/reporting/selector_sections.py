@@ -22,6 +22,8 @@ MAIN = ("auto:warm", "auto", "ppo", "ppo_tuned", "epsilon_greedy", "random")
 ORACLES = {"hindsight": "hindsight oracle", "expected": "expected oracle", "predictable": "predictable oracle", "per_task": "per-task oracle"}
 _FEW = 8
 _NORMAL = 1.959964
+_SMOOTH = 60
+"""Points of a curve of which there are many: sums and moving means are smooth."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def regret_figure(streams: Mapping[str, Stream], references: Sequence[str], look
     for reference in references:
         base = streams[reference].reward
         regrets = {name: np.nan_to_num(base - streams[name].reward).cumsum(axis=-1) for name in own.names if name != reference}
-        at, lines = _lines(regrets)
+        at, lines = _lines(regrets, _SMOOTH)
         panels.append(curves(f"to {reference}", at + 1, lines, own, ("decision", "cumulative regret (reward)")))
         ends += [f"{name} to {reference} {float(table[:, -1].mean()):.1f}" for name, table in regrets.items() if name not in look.hidden]
     caption = (
@@ -134,7 +136,7 @@ def share_figure(streams: Mapping[str, Stream], policies: Sequence[str], look: L
     shares = {name: own for name, own in _shares(streams, len(policies)).items() if len(policies) > 1}
     if not shares:
         return None
-    at = thinned(next(len(own[0]) for own in shares.values()))
+    at = thinned(next(len(own[0]) for own in shares.values()), _SMOOTH)
     caption = "Share of the decisions, over all seeds and the latest tenth of the stream up to each decision, in which a policy was chosen."
     ends = [
         f"{name} {policy} {share[-1]:.0f}%"
@@ -188,9 +190,9 @@ def over_seeds(values: Array) -> Estimate | None:
     return Estimate(float(means.mean()), float(means.mean() - half), float(means.mean() + half))
 
 
-def _lines(values: Mapping[str, Array]) -> tuple[NDArray[np.int64], list[Line]]:
-    """Which decisions are drawn, and of each name the mean over seeds with its band. All tables are (S, T) of the same T."""
-    at = thinned(next(iter(values.values())).shape[1])
+def _lines(values: Mapping[str, Array], most: int = 100) -> tuple[NDArray[np.int64], list[Line]]:
+    """Which decisions are drawn, `most` of them, and of each name the mean over seeds with its band. All tables are (S, T) of the same T."""
+    at = thinned(next(iter(values.values())).shape[1], most)
     lines = []
     for name, table in values.items():
         part = table[:, at]
