@@ -272,7 +272,8 @@ def test_every_kind_of_panel_is_drawn(made_of_all_marks):
     (one, two), panels = records(figure.spec, figure.spec["concat"][0])[:2], figure.spec["concat"]
     assert one["y"] == [1.0, None, 2.0] and one["low"] == [0.0, None, 1.0] and two["low"] == [None] * 3
     assert panels[-1]["layer"][0]["encoding"]["x"]["scale"]["type"] == "log"
-    assert figure._repr_mimebundle_()
+    shown = figure._repr_mimebundle_()  # in a notebook
+    assert shown["application/vnd.vegalite.v6+json"] == figure.spec and base64.b64decode(shown["image/png"]) == images["png"]
 
 
 @pytest.mark.parametrize("kind", ["log", "replay", "run"])
@@ -289,6 +290,13 @@ def test_every_figure_keeps_to_the_schema_is_not_blank_and_says_what_it_shows(al
         for panel in drawn:
             assert re.search(r"role-mark[^>]*>\s*<(?:path|text)", panel), figure.name
         assert len(figure.alternative) > 60 and re.search(r"\d", figure.alternative), figure.name
+
+
+def test_a_figure_is_saved_by_its_ending(made_of_all_marks, tmp_path):
+    files = [made_of_all_marks.save(tmp_path / "new" / f"figure.{ending}") for ending in ("png", "svg", "json")]
+    assert [file.read_bytes()[:5] for file in files] == [b"\x89PNG\r", b"<svg ", b'{"con']
+    with pytest.raises(UsageError, match=r"saved as \.png, \.svg or \.json"):
+        made_of_all_marks.save(tmp_path / "figure.pdf")
 
 
 def test_the_page_and_the_images_show_the_same_specification(page_of_log):

@@ -186,6 +186,8 @@ def test_a_click_on_a_context_shows_its_episodes(driver, pages, show):
         driver.execute_cdp_cmd("Input.dispatchMouseEvent", {"type": kind, "x": x, "y": y, "button": "left", "clickCount": 1})
     wait(driver, "return document.getElementById('detail').open", 5)
     assert "policy" in driver.execute_script("return document.getElementById('detail-body').innerText")
+    room = "return [...document.querySelectorAll('#detail .wide')].every((wide) => wide.scrollWidth <= wide.clientWidth + 1)"
+    assert driver.execute_script(room)
 
 
 def test_nothing_is_fetched(driver, pages, show):
@@ -282,6 +284,8 @@ def test_a_phone_shows_tables_as_cards_and_shortens_the_names_of_rows(driver, pa
     wait(driver, "return document.querySelector('#table-policies .wide').classList.contains('stacked')", 5)
     assert dict(driver.execute_script(cells)).items() >= {"policy": "small", "price (cents)": "0.0400"}.items()
     assert driver.execute_script(longest) <= 20
+    driver.execute_script("document.querySelector('#episode-list button').click()")
+    assert driver.execute_script("return [...document.querySelectorAll('#detail .wide')].every((wide) => wide.scrollWidth <= wide.clientWidth + 1)")
     show(pages["table"])
     assert driver.execute_script(longest) > 30
 

@@ -187,7 +187,7 @@ def test_the_page_shows_names_safely() -> None:
     page = Page(words, words, Verdict(words, [words]), [Section("a", words, [words])], [(words, words)])
     html = to_html(page)
     own = to_html(Page("k", "t", Verdict("h", ["s"]), [Section("a", "b", ["c"])], [("d", "e")]))
-    assert set(RAW.findall(html)) <= set(RAW.findall(own))  # plotly.js has some of its own
+    assert set(RAW.findall(html)) <= set(RAW.findall(own))  # Vega has some of its own
     assert SECRET not in html and "<script>alert" not in html and "\\x1b" in html
 
 

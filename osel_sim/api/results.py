@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 if TYPE_CHECKING:
-    import altair
     import pandas
 
     from osel_sim.formats.journal import Decision
     from osel_sim.formats.rollout_log import Row
+    from osel_sim.reporting.charts import Figure
 
 
 def frame(rows: Iterable[Any]) -> "pandas.DataFrame":
@@ -46,11 +46,11 @@ class RunResult:
         return frame(self.journal)
 
     @cached_property
-    def curve(self) -> "altair.TopLevelMixin":
-        """Mean reward so far, and the share of each policy."""
+    def curve(self) -> "Figure":
+        """Mean reward so far, and the share of each policy. It shows itself in a notebook; `.chart` is Altair's, `.save(FILE)` writes it."""
         from osel_sim.reporting.run_page import run_curve
 
-        return run_curve(self.folder).chart
+        return run_curve(self.folder)
 
 
 @dataclass(frozen=True)
@@ -115,11 +115,11 @@ class ReplayResult:
         return self._table("paired")
 
     @cached_property
-    def curve(self) -> "altair.TopLevelMixin":
-        """Mean reward of every selector over decisions, with the oracles."""
+    def curve(self) -> "Figure":
+        """Mean reward of every selector over decisions, with the oracles. It shows itself in a notebook; `curve.chart` is Altair's."""
         from osel_sim.reporting.replay_page import replay_curve
 
-        return replay_curve(self.folder).chart
+        return replay_curve(self.folder)
 
     def _table(self, name: str) -> "pandas.DataFrame":
         from osel_sim.analysis.result import tables

@@ -1,16 +1,21 @@
 """A figure: Altair charts side by side, with the words about them. Page, PNG, SVG and notebook all show the same Vega-Lite specification."""
 
+import base64
+import json
 import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal, cast
 
 import altair as alt
 import numpy as np
 from numpy.typing import ArrayLike
 
+from osel_sim.core.errors import UsageError
+from osel_sim.core.files import write_bytes
 from osel_sim.core.shown import all_shown
 from osel_sim.reporting.palette import LIGHT
 
@@ -144,9 +149,24 @@ class Figure:
         """The chart as Vega-Lite's JSON, its texts as they may be shown. The page embeds it, and the images are made from it."""
         return dict(all_shown(self.chart.to_dict(validate=False)))  # the tests validate; it takes longer than all the rest
 
-    def _repr_mimebundle_(self, *arguments: Any, **keywords: Any) -> Any:
-        """Shows itself in a notebook."""
-        return self.chart._repr_mimebundle_(*arguments, **keywords)
+    def save(self, file: Path | str) -> Path:
+        """Write it as `.png`, `.svg` or `.json` (Vega-Lite), by the file's ending; folders are made.
+
+        Raises:
+            UsageError: another ending.
+        """
+        path = Path(file)
+        kind = path.suffix.removeprefix(".")
+        if kind not in ("png", "svg", "json"):
+            raise UsageError(f"{path}: a figure is saved as .png, .svg or .json")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_bytes(path, json.dumps(self.spec).encode() if kind == "json" else to_images(self)[kind])
+        return path
+
+    def _repr_mimebundle_(self, *_: Any, **__: Any) -> dict[str, Any]:
+        """Shows itself in a notebook: drawn there where it can draw Vega-Lite, else as a picture. Nothing is fetched."""
+        picture = base64.b64encode(to_images(self)["png"]).decode()
+        return {"application/vnd.vegalite.v6+json": self.spec, "image/png": picture, "text/plain": f"{self.title}: {self.alternative}"}
 
 
 def to_images(figure: Figure) -> dict[str, bytes]:

@@ -92,7 +92,7 @@ def context_figure(log: LoggedOutcomes, weights: RewardWeights) -> Figure | None
     panels = clouds(layout.places, (about, layout.rows.tolist()), aspects)
     caption = (
         f"Contexts of {len(layout.rows):,} instances laid out by t-SNE; encoder {log.encoder}. Points that lie together look alike to the selector: "
-        "where they also share their best policy, context can help. A click on one shows its episodes."
+        "where they also share their best policy, context can help. A click on one shows its episodes, if they are on the page."
     )
     if {"several", "unknown"} & set(layout.labels.get("best policy", ())):
         caption += " Best policy: 'several' is a tie, 'unknown' a missing outcome."

@@ -131,7 +131,7 @@
       fit.params[0].value = [...holder.hiddenNames];
       // Without code made from text (`ast`): the page's policy allows none.
       const { view } = await vegaEmbed(plot, fit, { ast: true, renderer: "svg", actions: false, tooltip: { disableDefaultStyle: true } });
-      view.addEventListener("click", (_, item) => { if (item?.datum?.instance !== undefined) show(item.datum.instance); });
+      view.addEventListener("click", (_, item) => { if (item?.datum?.instance !== undefined) show(item.datum); });
       holder.views.push(view);
     }
     holder.dataset.drawn = "true";
@@ -143,22 +143,24 @@
     document.documentElement.dataset.ready = "true";
   }
 
-  let show = () => {};  // opens an instance's episodes; there may be none
+  let show = () => {};  // opens the episodes of a context; there may be none
 
   // ---- tables: one that is wider than its column becomes a card for each row
   const fit = (wide) => {
     wide.classList.remove("stacked");
     wide.classList.toggle("stacked", wide.querySelector("table").scrollWidth > wide.clientWidth + 1);
   };
-  const tables = [...document.querySelectorAll(".table-block .wide")];
-  tables.forEach((wide) => {
+  function labelled(wide) {
     const headings = [...wide.querySelectorAll("th")].map((cell) => cell.textContent);
     wide.querySelectorAll("td").forEach((cell, place) => {
       cell.dataset.label = headings[place % headings.length];
       const interval = cell.querySelector(".interval");
       if (interval) cell.title = `95% interval ${interval.textContent}`;
     });
-  });
+  }
+
+  const tables = [...document.querySelectorAll(".table-block .wide")];
+  tables.forEach(labelled);
 
   // ---- printing unfolds everything; afterwards it is as it was
   let folded = [];
@@ -390,6 +392,7 @@
       });
       body.append(comparison(episode), key, ...picks(episode));
       document.getElementById("detail").showModal();
+      body.querySelectorAll(".wide").forEach((wide) => { labelled(wide); fit(wide); });
     }
 
     // Safari plays a video from a blob, not from a data address.
@@ -401,10 +404,14 @@
       return video.url;
     }
 
-    // Of an instance what was chosen, or its first episode.
-    show = (number) => {
-      const own = all.filter((episode) => episode.about.number === number);
-      if (own.length) open(own.find((episode) => episode.chosen === 1) || own[0]);
+    // Of an instance what was chosen, or its first episode; of many instances the page has but some.
+    show = ({ instance, about }) => {
+      const own = all.filter((episode) => episode.about.number === instance);
+      if (own.length) return open(own.find((episode) => episode.chosen === 1) || own[0]);
+      const title = element("h3", "", about);
+      title.id = "detail-title";
+      document.getElementById("detail-body").replaceChildren(title, element("p", "caption", `Instance ${instance}: its episodes are not among those of this page.`));
+      return document.getElementById("detail").showModal();
     };
     Object.values(controls).forEach((control) => control.addEventListener("input", filter));
     more.addEventListener("click", () => extend(PAGE));
@@ -432,5 +439,5 @@
     waiting = setTimeout(drawAll, 200);
   });
   // The first screen first. What follows is one task, so that it is done before anything else happens to the page, such as printing.
-  draw(holders[0]).then(() => setTimeout(drawAll, 0));
+  Promise.all(holders.slice(0, 1).map(draw)).then(() => setTimeout(drawAll, 0));
 })();
