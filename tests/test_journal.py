@@ -1,7 +1,6 @@
 """The journal: exact, ordered, and whole after any cut."""
 
 import json
-from dataclasses import asdict
 
 import pytest
 
@@ -64,15 +63,15 @@ def decision(index=0, **more):
 
 def test_a_line_has_the_promised_fields_in_order_and_exact_numbers(tmp_path):
     journal = Lines(tmp_path / "episodes.jsonl")
-    journal.append(asdict(decision()))
-    journal.append(asdict(decision(1, reward=None, error="p: died")))
+    journal.append(decision().to_dict())
+    journal.append(decision(1, reward=None, error="p: died").to_dict())
     journal.close()
     lines = (tmp_path / "episodes.jsonl").read_text().splitlines()
     assert list(json.loads(lines[0])) == FIELDS
     assert list(json.loads(lines[0])["seconds"]) == ["upload", "inference", "download", "motion"]
     read = read_journal(tmp_path / "episodes.jsonl")
     assert read == [decision(), decision(1, reward=None, error="p: died")]
-    assert [to_line(asdict(one)).rstrip("\n") for one in read] == lines
+    assert [to_line(one.to_dict()).rstrip("\n") for one in read] == lines
     assert read[0].outcome.price == 2.8000000000000003
 
 
@@ -80,7 +79,7 @@ def test_any_cut_leaves_the_whole_lines_and_going_on_gives_the_same_bytes(tmp_pa
     whole = tmp_path / "whole.jsonl"
     journal = Lines(whole)
     for index in range(3):
-        journal.append(asdict(decision(index)))
+        journal.append(decision(index).to_dict())
     journal.close()
     raw = whole.read_bytes()
     ends = [position + 1 for position, byte in enumerate(raw) if byte == ord("\n")]
@@ -90,7 +89,7 @@ def test_any_cut_leaves_the_whole_lines_and_going_on_gives_the_same_bytes(tmp_pa
         journal = Lines(torn)
         assert len(journal.rows) == sum(end <= cut for end in ends)
         for index in range(len(journal.rows), 3):
-            journal.append(asdict(decision(index)))
+            journal.append(decision(index).to_dict())
         journal.close()
         assert torn.read_bytes() == raw
 
@@ -122,7 +121,7 @@ def test_a_broken_journal_is_refused_with_file_and_line(tmp_path, text, complain
 
 def test_a_gap_is_refused(tmp_path):
     journal = Lines(tmp_path / "episodes.jsonl")
-    journal.append(asdict(decision(1)))
+    journal.append(decision(1).to_dict())
     journal.close()
     with pytest.raises(DataError, match="index must be 0, got 1"):
         read_journal(tmp_path / "episodes.jsonl")
@@ -135,4 +134,4 @@ def test_a_missing_journal_is_refused(tmp_path):
 
 def test_nan_does_not_get_in(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
-        to_line(asdict(decision(reward=float("nan"))))
+        to_line(decision(reward=float("nan")).to_dict())

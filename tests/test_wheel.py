@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from osel_sim.__main__ import COMMANDS as COMMAND_NAMES
 from osel_sim.core import content
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-COMMANDS = sorted(file.stem for file in (CHECKOUT / "osel_sim").glob("*.py") if '__name__ == "__main__"' in file.read_text())
+COMMANDS = sorted(COMMAND_NAMES)
 
 
 @pytest.fixture(scope="module")

@@ -111,7 +111,7 @@ class Settings:
 @dataclass_transform(kw_only_default=True, frozen_default=True)
 def settings[Config: type](cls: Config) -> Config:
     """Make a class a configuration: a frozen dataclass whose values are checked when it is made."""
-    config = ConfigDict(extra="forbid", use_attribute_docstrings=True, arbitrary_types_allowed=True)
+    config = ConfigDict(extra="forbid", arbitrary_types_allowed=True)
     return cast(Config, pydantic_dataclass(frozen=True, kw_only=True, config=config)(cls))
 
 

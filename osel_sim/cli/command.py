@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 
 from osel_sim.api.settings import MAIN, OTHER, Group, Settings
 from osel_sim.cli.output import show_log
+from osel_sim.core.docstrings import field_docstrings
 from osel_sim.core.errors import OselError, SettingError, UnknownNameError, UsageError, did_you_mean
 from osel_sim.core.shown import shown
 
@@ -124,7 +125,7 @@ class Command[Config: Settings]:
         from cyclopts import Parameter
 
         hints = get_type_hints(self.config, include_extras=True)
-        described = descriptions(self.config)
+        described = field_docstrings(self.config)
         own = [_parameter(field, hints[field.name], described.get(field.name, "")) for field in fields(self.config)]  # type: ignore[arg-type]
         more: list[tuple[str, Any, Any, str]] = [("config", Path | None, None, _CONFIG_HELP)]
         more += [(flag, kind, False, words) if kind is bool else (flag, kind | None, None, words) for flag, (kind, words, _) in self.switches.items()]
@@ -213,22 +214,13 @@ def _parameter(field: "Field[Any]", hint: Any, description: str) -> inspect.Para
     choices = _choices(hint)
     flag = Parameter(
         name=field.name.upper() if needed else None,
-        help=" ".join(description.split()) + (f": {', '.join(choices)}" if choices else ""),
+        help=description + (f": {', '.join(choices)}" if choices else ""),
         group=_group(MAIN if needed else group),
         show_default=_words if shown else False,
     )
     annotation = Annotated[kind, flag]  # type: ignore[valid-type]
     style = inspect.Parameter.POSITIONAL_ONLY if needed else inspect.Parameter.KEYWORD_ONLY
     return inspect.Parameter(field.name, style, default=default, annotation=annotation)
-
-
-def descriptions(config: type[Settings]) -> dict[str, str]:
-    """Docstrings of a configuration's fields; pydantic keeps them with the class that declares the field."""
-    found: dict[str, str] = {}
-    for base in reversed(config.__mro__):
-        own = getattr(base, "__pydantic_fields__", {})
-        found |= {name: field.description for name, field in own.items() if field.description}
-    return found
 
 
 def _plain_type(hint: Any) -> Any:

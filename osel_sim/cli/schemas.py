@@ -8,6 +8,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from pydantic_core import core_schema
 
 from osel_sim.core import content
+from osel_sim.core.docstrings import field_docstrings
 from osel_sim.core.files import write_json
 from osel_sim.formats.catalogue import CatalogueFile
 from osel_sim.formats.policy_file import PolicyFile
@@ -29,10 +30,9 @@ class _Schema(GenerateJsonSchema):
 
     def dataclass_schema(self, schema: core_schema.DataclassSchema) -> JsonSchemaValue:
         result = super().dataclass_schema(schema)
-        for base in schema["cls"].__mro__:  # pydantic takes descriptions from the class itself only
-            for key, about in getattr(base, "__pydantic_fields__", {}).items():
-                if about.description and key in result["properties"]:
-                    result["properties"][key].setdefault("description", about.description)
+        for key, words in field_docstrings(schema["cls"]).items():
+            if key in result["properties"]:
+                result["properties"][key].setdefault("description", words)
         return result
 
     def field_title_should_be_set(self, schema: Any) -> bool:
