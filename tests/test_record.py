@@ -132,7 +132,7 @@ def test_repeats_added_to_a_log_give_the_bytes_of_all_at_once(world, reference):
     assert resume(world, folder, "--repeat-every", 2).returncode == 2
     for flag, given in (("--instances", 7), ("--level", "0 2"), ("--action-noise", 0.5)):
         other = resume(world, folder, flag, *str(given).split())
-        assert other.returncode == 2 and f"{flag} {given}: {folder / 'run.json'} began with" in other.stderr
+        assert other.returncode == 2 and f"{flag}: {given}, but {folder / 'run.json'} began with" in other.stderr
     assert files(folder) == files(reference[0])
 
 
@@ -331,7 +331,7 @@ def test_another_robot_is_recorded_and_stays_that_of_the_recording(world, refere
     assert resume(world, folder).returncode == 0 and files(folder) == before
     assert record_main(["--resume", "--out", str(folder), "--robot", "Panda"]) == 2
     text = capsys.readouterr().err
-    assert "--robot: Panda: " in text and "began with UR5e" in text
+    assert "--robot: Panda, but " in text and "began with UR5e" in text
 
 
 def test_summary_of_a_log(reference, capsys):

@@ -169,10 +169,12 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
             own = getattr(config, name)
             if (list(own) if isinstance(own, tuple) else own) != began[_FIXED[name]]:
                 words = " ".join(map(str, own)) if isinstance(own, tuple) else own
-                raise SettingError(name, f"{words}: {folder / RUN} began with {began[_FIXED[name]]}; leave it out, or give another --out")
+                raise SettingError(name, f"{words}, but {folder / RUN} began with {began[_FIXED[name]]}; leave it out, or give another --out")
         robot = began.get("robot")
         if config.robot not in (None, robot or DEFAULT_ROBOT):
-            raise SettingError("robot", f"{config.robot}: {folder / RUN} began with {robot or DEFAULT_ROBOT}; leave it out, or give another --out")
+            raise SettingError(
+                "robot", f"{config.robot}, but {folder / RUN} began with {robot or DEFAULT_ROBOT}; leave it out, or give another --out"
+            )
         values["robot"] = robot if isinstance(robot, str) else None
         values["policies"] = tuple(dict.fromkeys([*began["policies"], *(config.policies or ())]))
         values["encoder"] = config.encoder or began["encoder"].partition("@")[0]
