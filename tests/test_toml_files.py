@@ -255,7 +255,7 @@ def test_a_byte_order_mark_and_line_ends_of_other_systems_change_nothing(kind, f
     text = file.read_text()
     same = tmp_path / file.name
     same.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
-    SHIPPED[kind][0](same)
+    assert repr(SHIPPED[kind][0](same)).replace(str(tmp_path), str(file.parent)) == repr(SHIPPED[kind][0](file))
 
 
 @pytest.mark.parametrize(

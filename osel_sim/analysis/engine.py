@@ -4,7 +4,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,11 +15,8 @@ from osel_sim.analysis.warm_start import WarmStart, show
 from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
-from osel_sim.interface.selector import Selector
+from osel_sim.interface.selector import SelectorFactory
 from osel_sim.selection.reward import RewardWeights
-
-Factory = Callable[[Sequence[str], int, int], Selector]
-"""Makes a selector of the policies' names, the length of a context and a seed."""
 
 WARM = ":warm"
 """Ending of the name of a selector that is shown all outcomes of other instances before its stream begins."""
@@ -46,7 +42,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class _Material:
-    """What a worker needs: contexts float32 (N, D), seeds, policies, and of each setup its rewards (N, P, R) and its streams."""
+    """What a worker needs: contexts float32 (N, D), seeds, policies, of each setup its rewards (N, P, R) and its streams, and selectors of others."""
 
     contexts: NDArray[np.float32]
     seeds: tuple[int, ...]
@@ -54,6 +50,7 @@ class _Material:
     setups: tuple[Setup, ...]
     rewards: tuple[NDArray[np.float64], ...]
     streams: tuple[Streams, ...]
+    factories: Mapping[str, SelectorFactory]
 
 
 _Job = tuple[int, str, int]
@@ -68,7 +65,7 @@ def replay(
     decisions: int | None = None,
     workers: int = 1,
     progress: Callable[[int], Any] | None = None,
-    factories: Mapping[str, Factory] | None = None,
+    factories: Mapping[str, SelectorFactory] | None = None,
 ) -> list[Choices]:
     """Show the streams of all seeds to every selector, under each setup.
 
@@ -79,8 +76,7 @@ def replay(
         decisions: length of a stream; None: all instances.
         workers: processes; with 1 it happens in this one.
         progress: called with a number of decisions made.
-        factories: selector -> what makes it, where it is none of the registry's; these are replayed in this process, since a class of a notebook
-            cannot be imported by another.
+        factories: selector -> what makes it, where it is none of the registry's.
 
     Raises:
         UsageError: a selector is to start warm and there is nothing to show it.
@@ -90,12 +86,10 @@ def replay(
         raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to start warm with")
     tables = tuple(log.rewards(setup.weights) for setup in setups)
     streams = tuple(draw_streams(table, seeds, decisions) for table in tables)
-    material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams)
+    material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams, factories or {})
     jobs = [(at, name, number) for name in sorted(selectors, key=_slowness) for at in range(len(setups)) for number in range(len(seeds))]
     chosen = [{name: np.zeros(own.order.shape, np.int8) for name in selectors} for own in streams]
-    made = factories or {}
-    elsewhere = [job for job in jobs if job[1] not in made]
-    for (at, name, number), columns in chain(_run_own(material, [job for job in jobs if job[1] in made], made), _run(material, elsewhere, workers)):
+    for (at, name, number), columns in _run(material, jobs, workers):
         chosen[at][name][number] = columns
         if progress is not None:
             progress(len(columns))
@@ -109,7 +103,7 @@ def replay_one(
     policies: Sequence[str],
     seed: int,
     warm_start: WarmStart | None = None,
-    factory: Factory | None = None,
+    factory: SelectorFactory | None = None,
     **settings: Any,
 ) -> NDArray[np.int8]:
     """Show one stream to one selector, which sees the reward of its choices only.
@@ -146,12 +140,6 @@ def _slowness(name: str) -> int:
     return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
 
 
-def _run_own(material: _Material, jobs: Sequence[_Job], factories: Mapping[str, Factory]) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
-    with _one_thread():
-        for job in jobs:
-            yield _replay_job(material, job, factories[job[1]])
-
-
 def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
     if workers == 1:
         with _one_thread():
@@ -171,14 +159,15 @@ def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int8]]]:
     return lambda job, _: [_replay_job(material, job)]
 
 
-def _replay_job(material: _Material, job: _Job, factory: Factory | None = None) -> tuple[_Job, NDArray[np.int8]]:
+def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int8]]:
     at, name, number = job
     setup, streams = material.setups[at], material.streams[at]
     rewards = streams.rewards(material.rewards[at], number)
     contexts = material.contexts[streams.order[number]]
     contexts.flags.writeable = False
     kind, shown = name.removesuffix(WARM), setup.warm_start if name.endswith(WARM) else None
-    return job, replay_one(kind, contexts, rewards, material.policies, material.seeds[number], shown, factory, **setup.settings.get(name, {}))
+    seed, factory = material.seeds[number], material.factories.get(name)
+    return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, **setup.settings.get(name, {}))
 
 
 def _limit_threads() -> Any:

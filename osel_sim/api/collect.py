@@ -59,15 +59,14 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
         OselError: whatever is wrong with the settings or what is in the folder already; the message says what.
     """
     from osel_sim.formats.levels import parse_axes, resolve
-    from osel_sim.formats.library import select_tasks
     from osel_sim.formats.run_config import robots_said
-    from osel_sim.sim.robots import with_robot
+    from osel_sim.suites.registry import select_task_files
     from osel_sim.training import collection
 
     config = CollectConfig.of(**values) if config is None else config.changed(**values)
     if config.episodes is None or config.out is None:
         raise SettingError("out" if config.out is None else "episodes", "is missing")
-    tasks = with_robot(select_tasks(config.task, config.tasks), config.robot)
+    tasks = select_task_files(config.task, config.tasks, config.robot)
     axes = parse_axes(config.axis)
     outs = [config.out] if len(tasks) == 1 else [config.out / task.name for task in tasks]
     for task, out in zip(tasks, outs, strict=True):

@@ -37,10 +37,10 @@ def make_env(task: str, *, tasks: Path | str | None = None, **options: Any) -> "
     Raises:
         UnknownNameError: no such task; names the nearest.
     """
-    from osel_sim.formats.library import select_tasks
     from osel_sim.sim.env import TaskEnv
+    from osel_sim.suites.registry import select_task_files
 
-    return TaskEnv(select_tasks([task], None if tasks is None else Path(tasks))[0], **options)
+    return TaskEnv(select_task_files([task], None if tasks is None else Path(tasks))[0], **options)
 
 
 def load_policy(name: str, *, task: str | None = None, policies_dir: Path | str | None = None) -> "Policy":

@@ -15,10 +15,8 @@ if TYPE_CHECKING:
     from osel_sim.analysis.engine import Setup
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
-    from osel_sim.interface.selector import Selector
+    from osel_sim.interface.selector import SelectorFactory
     from osel_sim.selection.reward import RewardWeights
-
-    Factory = Callable[[Sequence[str], int, int], Selector]
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +64,7 @@ class ReplayConfig(LoggedRewardSettings):
 def replay(
     log: "Path | str | ReplayConfig",
     *,
-    selectors: "str | Sequence[str | Factory] | None" = None,
+    selectors: "str | Sequence[str | SelectorFactory] | None" = None,
     on_result: Callable[[ReplayResult], None] | None = None,
     **values: Any,
 ) -> ReplayResult:
@@ -81,18 +79,16 @@ def replay(
     Raises:
         OselError: whatever is wrong with the settings or the log; the message says what.
     """
-    factories: dict[str, Factory] = {}
+    from osel_sim.interface.selector import factory_name
+
+    factories: dict[str, SelectorFactory] = {}
     if isinstance(selectors, str):
         selectors = [selectors]
     if selectors is not None:
-        factories = {_name(selector): selector for selector in selectors if not isinstance(selector, str)}
-        values["selectors"] = [selector if isinstance(selector, str) else _name(selector) for selector in selectors]
+        factories = {factory_name(selector): selector for selector in selectors if not isinstance(selector, str)}
+        values["selectors"] = [selector if isinstance(selector, str) else factory_name(selector) for selector in selectors]
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
     return _Replay(config, factories, on_result).execute()
-
-
-def _name(factory: Any) -> str:
-    return str(getattr(factory, "name", None) or getattr(factory, "__name__", type(factory).__name__))
 
 
 @dataclass(frozen=True)
@@ -100,7 +96,7 @@ class _Replay:
     """One call of `replay`."""
 
     config: ReplayConfig
-    factories: "Mapping[str, Factory]"
+    factories: "Mapping[str, SelectorFactory]"
     on_result: Callable[[ReplayResult], None] | None
 
     def execute(self) -> ReplayResult:

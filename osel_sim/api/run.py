@@ -4,7 +4,7 @@ import contextlib
 import logging
 import signal
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.interface.encoder import Encoder
     from osel_sim.interface.policy import Policy
-    from osel_sim.interface.selector import Selector
+    from osel_sim.interface.selector import Selector, SelectorFactory
     from osel_sim.interface.suite import Task
     from osel_sim.policy.objects import PolicyObject
     from osel_sim.selection.reward import RewardWeights
 
-    SelectorLike = str | Callable[[Sequence[str], int, int], Selector]
+    SelectorLike = str | SelectorFactory
 
 logger = logging.getLogger(__name__)
 
@@ -111,6 +111,7 @@ def run(
     Raises:
         OselError: whatever is wrong with the settings, the files they name, or what came of them; the message says what.
     """
+    from osel_sim.interface.selector import factory_name
     from osel_sim.policy.objects import split_objects
 
     names, objects = split_objects(policies)
@@ -118,15 +119,11 @@ def run(
         values["policies"] = names
     factory = None
     if selector is not None:
-        values["selector"] = selector if isinstance(selector, str) else _name(selector)
+        values["selector"] = selector if isinstance(selector, str) else factory_name(selector)
         factory = None if isinstance(selector, str) else selector
     config = RunConfig.of(**values) if config is None else config.changed(**values)
     with trusting(config.trust):
         return _Run(config, objects, factory, subscribers).execute()
-
-
-def _name(factory: Any) -> str:
-    return str(getattr(factory, "name", None) or getattr(factory, "__name__", type(factory).__name__))
 
 
 class _Run:
@@ -142,7 +139,7 @@ class _Run:
         self,
         config: RunConfig,
         objects: "Mapping[str, PolicyObject]",
-        factory: "Callable[..., Selector] | None",
+        factory: "SelectorFactory | None",
         watchers: "Sequence[RunSubscriber]",
     ) -> None:
         from osel_sim.api.reward import weights_of

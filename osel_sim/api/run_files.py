@@ -24,7 +24,8 @@ def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     if live.options.counterfactual:
         summary |= _comparison(live, chosen)
     write_json(live.folder / "summary.json", summary)
-    save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
+    if hasattr(live.selector, "state_dict"):  # a selector of one's own need only choose and learn; a resumed run learns from the journal anyway
+        save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
     return summary
 
 

@@ -5,7 +5,6 @@ Python API take it as keywords. A field's docstring is its help; `Group` says un
 """
 
 import os
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, cast, dataclass_transform
@@ -14,7 +13,7 @@ from annotated_types import Ge, MinLen
 from pydantic import AfterValidator, AllowInfNan, BeforeValidator, ConfigDict, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
-from osel_sim.core.errors import OselError, SettingError, UnknownNameError, did_you_mean
+from osel_sim.core.errors import SettingError, UnknownNameError
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ class Settings:
         try:
             config = cls(**values)
         except ValidationError as error:
-            raise setting_error(error) from None
+            raise _setting_error(error, cls) from None
         object.__setattr__(config, "_given", frozenset(values))
         return config
 
@@ -98,11 +97,6 @@ class Settings:
         """The same configuration with some other values; raises as `of` does."""
         return self.of(**{name: getattr(self, name) for name in self.given} | values) if values else self
 
-    @classmethod
-    def schema(cls) -> dict[str, Any]:
-        """JSON Schema of a file for `--config`."""
-        return TypeAdapter(cls).json_schema()
-
     def to_json(self) -> dict[str, Any]:
         """As values that JSON holds, all settings by name; `of(**to_json())` is the same configuration."""
         return cast(dict[str, Any], TypeAdapter(type(self)).dump_python(self, mode="json"))
@@ -115,44 +109,14 @@ def settings[Config: type](cls: Config) -> Config:
     return cast(Config, pydantic_dataclass(frozen=True, kw_only=True, config=config)(cls))
 
 
-def setting_error(error: ValidationError) -> OselError:
-    """The first thing wrong with a configuration, in the project's words."""
-    fault = error.errors(include_url=False)[0]
-    cause = fault.get("ctx", {}).get("error")
-    if isinstance(cause, OselError):
-        return cause
-    name = str(fault["loc"][0]) if fault["loc"] else ""
-    return SettingError(name, _PROBLEMS.get(fault["type"], _plain)(fault))
+def _setting_error(error: ValidationError, config: type) -> SettingError:
+    """The first thing wrong with a configuration, in the words that files are told in."""
+    from osel_sim.formats.schema_node import Node
+    from osel_sim.formats.toml_faults import faults_of
 
-
-def _integer(fault: Mapping[str, Any]) -> str:
-    return f"must be an integer, got {fault['input']!r}"
-
-
-def _choice(fault: Mapping[str, Any]) -> str:
-    known = [part.strip("'") for part in fault["ctx"]["expected"].replace(" or ", ", ").split(", ")]
-    return f"unknown value {str(fault['input'])!r}: {did_you_mean(str(fault['input']), known)}known: {', '.join(known)}"
-
-
-def _plain(fault: Mapping[str, Any]) -> str:
-    message: str = fault["msg"].removeprefix("Value error, ")
-    return message[0].lower() + message[1:] + ("" if fault["type"] == "value_error" else f", got {fault['input']!r}")
-
-
-_PROBLEMS: dict[str, Callable[[Mapping[str, Any]], str]] = {
-    "greater_than_equal": lambda fault: f"must be {fault['ctx']['ge']:g} or more, got {fault['input']}",
-    "greater_than": lambda fault: f"must be more than {fault['ctx']['gt']:g}, got {fault['input']}",
-    "less_than_equal": lambda fault: f"must be {fault['ctx']['le']:g} or less, got {fault['input']}",
-    "too_short": lambda fault: "needs at least one value",
-    "finite_number": lambda fault: f"must be a finite number, got {fault['input']}",
-    "int_type": _integer,
-    "int_parsing": _integer,
-    "int_from_float": _integer,
-    "float_type": lambda fault: f"must be a number, got {fault['input']!r}",
-    "float_parsing": lambda fault: f"must be a number, got {fault['input']!r}",
-    "literal_error": _choice,
-    "missing": lambda fault: "is missing",
-}
+    schema = TypeAdapter(config).json_schema()
+    key, problem = faults_of(error, Node(schema, schema))[0]
+    return SettingError(key.partition("[")[0], problem)
 
 
 @settings

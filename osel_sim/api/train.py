@@ -5,14 +5,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from annotated_types import Gt, Lt
+from annotated_types import Ge, Le
 from pydantic import AllowInfNan
 
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Index, Names, Settings, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UnknownNameError, UsageError
 from osel_sim.core.trust import trusting
 
-Minutes = Annotated[float, Gt(0.0), Lt(1e5), AllowInfNan(False)]
+Minutes = Annotated[float, Ge(0.001), Le(1e5), AllowInfNan(False)]
 
 
 @settings
@@ -155,7 +155,7 @@ def train_encoder(config: EncoderTrainConfig | None = None, /, **values: Any) ->
         OselError: whatever is wrong with the settings or the folder; the message says what.
     """
     from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
-    from osel_sim.formats.library import select_tasks
+    from osel_sim.suites.registry import select_task_files
     from osel_sim.training.encoder import train as encoder_training
 
     config = EncoderTrainConfig.of(**values) if config is None else config.changed(**values)
@@ -163,7 +163,7 @@ def train_encoder(config: EncoderTrainConfig | None = None, /, **values: Any) ->
         raise UnknownNameError("encoder to train", config.encoder, [DEFAULT_ENCODER])
     if config.data is None:
         raise SettingError("data", "is missing: give the folder of rendered scenes")
-    tasks = tuple(task.name for task in select_tasks(config.task))
+    tasks = tuple(task.name for task in select_task_files(config.task))
     wanted = encoder_training.EncoderSettings(tasks, tuple(config.level), config.steps, config.seed, config.scenes, config.test_scenes)
     out = config.out or config.data / config.encoder
     return out, encoder_training.train(wanted, config.data, out, config.minutes, config.device, config.resume)

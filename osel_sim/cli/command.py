@@ -29,9 +29,6 @@ BROKEN_PIPE = 141
 ADDING = ("--axis", "--camera", "--trust")
 """Flags that may be repeated, each time with more."""
 
-Main = Callable[[Sequence[str] | None], int]
-"""Takes the command line's words (None: those of the process), returns the exit code."""
-
 Switch = tuple[Any, str, Callable[[Mapping[str, Any]], int] | None]
 
 _CONFIG_HELP = "TOML or JSON file with settings, or a run.json; flags given beside it win"
@@ -158,10 +155,11 @@ def read_settings(file: Path, config: type[Settings]) -> dict[str, Any]:
     """Settings of a file: TOML, JSON, or a `run.json` that a run left.
 
     Raises:
-        DataError: it cannot be read.
+        DataError, ContentError: it cannot be read.
         UnknownNameError: it has a setting that the command does not.
     """
-    from osel_sim.core.files import read_json, read_toml
+    from osel_sim.core.files import read_json
+    from osel_sim.formats.toml_file import read_toml
 
     data = read_toml(file) if file.suffix == ".toml" else read_json(file)
     data = data["settings"] if isinstance(data.get("settings"), dict) else data

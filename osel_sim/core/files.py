@@ -6,7 +6,6 @@ import json
 import math
 import os
 import shutil
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -126,18 +125,6 @@ def read_json(file: Path, hint: str = "") -> dict[str, Any]:
     if not isinstance(data, dict):
         raise DataError(f"{file}: expected an object, got {type(data).__name__}")
     return data
-
-
-def read_toml(file: Path) -> dict[str, Any]:
-    """A TOML file; a byte order mark at its beginning is passed over.
-
-    Raises:
-        DataError: the file is missing or is not TOML.
-    """
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError) as error:
-        raise DataError(f"{file} cannot be read as TOML ({error})") from None
 
 
 def digest(path: Path) -> str:

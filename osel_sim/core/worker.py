@@ -1,4 +1,7 @@
-"""What runs in a worker process of `osel_sim.core.processes`. It imports next to nothing, so that it follows its parent from its first moment."""
+"""What runs in a worker process of `osel_sim.core.processes`. It imports next to nothing, so that it follows its parent from its first moment.
+
+What it unpickles comes from the process that started it, over a socket pair that no other process has.
+"""
 
 import contextlib
 import os

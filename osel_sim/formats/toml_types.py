@@ -11,7 +11,7 @@ from pydantic_core import CoreSchema, InitErrorDetails, PydanticCustomError, cor
 from osel_sim.core.errors import did_you_mean
 
 TABLE = ConfigDict(extra="forbid", allow_inf_nan=False, defer_build=True)
-"""Configuration of every model: unknown keys are refused, numbers are finite, docstrings of attributes are the JSON Schema's descriptions.
+"""Configuration of every model: unknown keys are refused, numbers are finite.
 
 Validators see the fields above theirs (`info.data`): defaults are `dataclasses.field`s, as pydantic would put its own `Field`s before all others."""
 

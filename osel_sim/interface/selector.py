@@ -1,7 +1,7 @@
 """What a selector is: it chooses a policy for a context and learns from the reward of that choice alone."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -63,3 +63,12 @@ class Selector(Protocol):
     def add_policy(self, name: str) -> None:
         """Make one more policy available; what was learned of the others stays."""
         ...
+
+
+SelectorFactory = Callable[[Sequence[str], int, int], Selector]
+"""Makes a selector of the policies' names, the length of a context and a seed: a class, or a function."""
+
+
+def factory_name(factory: SelectorFactory) -> str:
+    """What a selector that is none of the registry's is called: by its `name`, else by its class or function."""
+    return str(getattr(factory, "name", None) or getattr(factory, "__name__", type(factory).__name__))

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.instance import SUITE_SEPARATOR
 from osel_sim.interface.suite import OURS, Suite, Task
@@ -88,6 +89,20 @@ def select_tasks(wanted: Sequence[str], folder: Path | None = None, robot: str |
     for name in wanted:
         chosen |= {task.name: task for task in _named(name, folder, robot)}
     return list(chosen.values())
+
+
+def select_task_files(wanted: Sequence[str], folder: Path | None = None, robot: str | None = None) -> list[TaskSpec]:
+    """Task files by name, as `select_tasks` takes them, for what works on our own tasks only.
+
+    Raises:
+        UsageError: a task of another suite; otherwise as `select_tasks`.
+    """
+    files = []
+    for task in select_tasks(wanted, folder, robot):
+        if task.suite.spec.name != OURS:
+            raise UsageError(f"task {task.name!r} is of the suite {task.suite.spec.name!r}; only osel_sim's own tasks can be used here ({LISTING})")
+        files.append(task.suite.tasks.spec(task.short_name))  # type: ignore[attr-defined]  # our suite's tasks are files
+    return files
 
 
 def common_specification(tasks: Iterable[Task]) -> EnvironmentSpec:

@@ -9,8 +9,8 @@ from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER, VOCABULARY, WEIG
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.files import atomic, finite, write_json
 from osel_sim.formats.levels import LEVELS
-from osel_sim.formats.library import select_tasks
 from osel_sim.formats.task_file import TaskSpec
+from osel_sim.suites.registry import select_task_files
 
 if TYPE_CHECKING:
     from osel_sim.training.encoder.scenes import Scenes
@@ -92,7 +92,7 @@ def train(settings: EncoderSettings, data: Path, out: Path, minutes: float | Non
         raise UsageError(f"minutes must be more than 0, got {minutes}")
     if not resume and (out / WEIGHTS).exists():
         raise UsageError(f"{out} holds a checkpoint already; pass --resume to go on with it, or another --out")
-    tasks = select_tasks(settings.tasks)
+    tasks = select_task_files(settings.tasks)
     scenes = [cached_scenes(data, task, settings.scenes, "train", recipe.IMAGE_SIZE, settings.levels) for task in tasks]
     test = [cached_scenes(data, task, settings.test_scenes, "test", recipe.IMAGE_SIZE, settings.levels) for task in tasks]
     recipe.write_architecture(out)
