@@ -338,7 +338,7 @@ def test_settings_are_checked_when_they_are_made(settings: dict[str, Any], says:
         (["--encoder", "osel_smal"], "did you mean 'osel_small'"),
         (["--task", "pick_plac"], "did you mean 'pick_place'"),
         (["--steps", "0"], "--steps: must be 1 or more, got 0"),
-        (["--minutes", "-1"], "--minutes: must be more than 0"),
+        (["--minutes", "-1"], "--minutes: must lie in [0.001, 100000.0], got -1.0"),
     ],
 )
 def test_wrong_training_arguments_are_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path, arguments: list[str], says: str) -> None:

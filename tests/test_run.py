@@ -205,7 +205,7 @@ def test_a_dead_server_is_replaced_by_the_local_policy_and_the_journal_says_so(w
         (["--selector", "auto", "--warm-start", "."], "rollouts.parquet"),
         (["--preset", "waym"], "did you mean 'waymo'?"),
         (["--episodes", "0"], "--episodes: must be 1 or more, got 0"),
-        (["--alpha-time", "-0.1"], "--alpha-time: must be 0 or more"),
+        (["--alpha-time", "-0.1"], "--alpha-time: must be 0.0 or more"),
         (["--level", "17"], "unknown level 17"),
         (["--axis", "camra=2"], "did you mean 'camera'?"),
         (["--axis", "camera"], "must read AXIS=LEVEL"),
