@@ -206,6 +206,7 @@ def test_a_failed_call_hands_over_to_the_fallback_for_the_rest(env, instance):
     assert {frame.policy for frame in steps.frames[:13]} == {"large"}
     assert {frame.policy for frame in steps.frames[13:]} == {"small"}
     assert (outcome.calls, outcome.actions) == (2, 8)
+    assert outcome.fallback_steps == outcome.steps - 13
     assert outcome.price == pytest.approx(0.02 * 8 + 0.1 * 2 + 0.5 + 0.01 * fallback.calls)
     assert fallback.resets == [(instance.instruction, episode_seed(instance.key, "small", 0))]
 
@@ -213,7 +214,7 @@ def test_a_failed_call_hands_over_to_the_fallback_for_the_rest(env, instance):
 def test_a_failed_call_without_fallback_is_an_error(env, instance):
     outcome = run_episode(env, instance, Driver(spec("large", mode="blocking"), Numbered(fail_at=1)))
     assert outcome.error == "large: deadline"
-    assert outcome.fallback is None
+    assert outcome.fallback is None and outcome.fallback_steps is None
     assert outcome.steps == 5
 
 

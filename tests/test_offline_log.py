@@ -7,9 +7,13 @@ import pytest
 from synthetic_log import clusters, make_row, write_log
 
 from osel_sim.analysis.log import read_log
+from osel_sim.analysis.outcomes import per_group
+from osel_sim.cli.console import console
+from osel_sim.cli.rollout_tables import print_rollouts
 from osel_sim.core.content import root
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.reporting.episodes import note_of
 from osel_sim.selection.reward import PRESETS, RewardWeights, reward
 
 SHIPPED = root() / "assets" / "logs" / "pick_place"
@@ -42,6 +46,28 @@ def test_errors_and_what_never_ran_are_missing_not_failures(tmp_path: Path):
     assert log.errors.sum() == 1 and log.errors[0, 1, 0]
     assert log.only(["b"]).success.shape == (2, 1, 2) and log.take([1]).keys == ("i1",)
     assert log.contexts[1].tolist() == [2, 2, 2]
+
+
+def test_a_fallbacks_successes_are_told_apart_and_credited_to_nobody(tmp_path: Path, capsys):
+    dead = {"fallback": "closed the connection", "actions": 0, "fallback_steps": 20}
+    late = {"fallback": "deadline", "actions": 8, "fallback_steps": 12}
+    rows = [make_row("a", "remote", **dead), make_row("b", "remote", **late), make_row("c", "remote"), make_row("d", "remote", success=False, **dead)]
+    write_log(tmp_path, rows, {name: np.ones(4) for name in "abcd"})
+    assert read_rollouts(tmp_path)[1]["schema_version"] == 4
+    log = read_log(tmp_path)
+    assert log.success.ravel().tolist() == [0.0, 1.0, 1.0, 0.0]
+    assert log.subgoals.ravel().tolist() == [0.0, 1.0, 1.0, 0.0]
+    assert log.fallbacks.ravel().tolist() == [True, True, False, True]
+    assert log.solved_by_fallback.ravel().tolist() == [True, True, False, False]
+    weights = RewardWeights(0.2, 0.01)
+    everything = per_group(log, weights)[0]
+    assert (everything.fallbacks, everything.solved_by_fallback, everything.success.value) == (3, 2, 0.5)
+    assert log.rewards(weights).ravel().tolist() == pytest.approx([reward(row.outcome, weights) for row in rows])
+    print_rollouts(console(), rows, weights)
+    cells = [cell.strip() for cell in next(line for line in capsys.readouterr().out.splitlines() if "remote" in line).split("│")]
+    assert "50% [15, 85]" in cells and cells[-4:-1] == ["3", "2", "0"]  # fallbacks, solved by them, errors
+    assert note_of(rows[0])["fallback"] == "closed the connection; it drove 20 of 20 steps; it solved the task alone, which is no success of remote"
+    assert note_of(rows[1])["fallback"] == "deadline; it drove 12 of 20 steps"
 
 
 def test_expected_costs_are_those_of_successes_where_there_are_any(tmp_path: Path):

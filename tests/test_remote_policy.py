@@ -130,6 +130,58 @@ def test_a_lying_server_fails_the_rest_of_the_episode_and_the_next_one_tries_aga
         remote.close()
 
 
+@pytest.mark.parametrize(("how", "answers"), [("hangs up", 2), ("goes silent", 2), ("hangs up after the reset", 0), ("mid-episode", 1)])
+def test_the_first_call_of_an_episode_is_repeated_once_where_the_connection_had_died(tmp_path, how, answers):
+    """A stranger's server or a proxy drops idle connections; it knows no reset, so that only the next question shows it."""
+    connections = []
+
+    def answer(connection):
+        connections.append(connection)
+        for number, _ in enumerate(connection):
+            if len(connections) > 1 or number < answers:
+                connection.send(pack({"actions": np.full((4, 7), 0.5)}))
+            if len(connections) == 1 and number == answers - 1 and how == "hangs up":
+                return
+            if len(connections) == 1 and number == answers and how != "goes silent":
+                return
+
+    with serving_with(answer, pack({})) as url:
+        remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, timeout=0.5))
+        remote.reset("x", (1,))
+        failures = [remote.call(observation()).failure for _ in range(2)]
+        if how == "mid-episode":
+            assert failures[0] is None and "closed the connection" in failures[1]
+        else:
+            assert failures == [None, None]
+        remote.reset("x", (2,))
+        assert [remote.call(observation()).failure for _ in range(2)] == [None, None]
+        assert len(connections) == 2
+        remote.close()
+
+
+def test_a_server_that_never_answers_is_asked_once_an_episode(tmp_path):
+    asked = []
+
+    def answer(connection):
+        asked.extend(connection)
+
+    with serving_with(answer, pack({})) as url:
+        remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, timeout=0.2))
+        for episode in range(2):
+            remote.reset("x", (episode,))
+            assert "no answer within 0.2 s" in remote.call(observation()).failure
+        remote.close()
+        assert len(asked) == 2
+
+
+def test_the_time_for_an_answer_is_a_key_of_the_policy_file(tmp_path):
+    with serving_with(lambda connection: time.sleep(1.0), pack({})) as url:
+        spec = policy_spec(tmp_path, url=f'{url}"\ntimeout = 0.15\n#')
+        assert spec.remote.timeout == 0.15
+        with pytest.raises(RemoteError, match="no answer within 0.2 s"):
+            open_remote(spec, ENVIRONMENT, start_timeout=0.2)
+
+
 def test_a_server_that_is_gone_fails_calls_not_resets(tmp_path):
     with serving() as url:
         remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, TOKEN, timeout=2))

@@ -55,6 +55,16 @@ def test_unknown_words():
         RewardWeights(0.1, 0.1, success="subgoal")
 
 
+def test_what_a_fallback_did_alone_is_no_success_of_the_policy():
+    """Else a policy whose server is dead would be as good as its fallback, and dearer."""
+    weights = RewardWeights(0.2, 0.01)
+    charged = -0.2 * math.log10(10.0) - 0.01 * 8
+    alone = replace(REMOTE, actions=0, fallback="closed the connection", fallback_steps=180)
+    assert reward(alone, weights) == pytest.approx(charged)
+    assert reward(alone, RewardWeights(0.0, 0.0, success="subgoals")) == 0.0
+    assert reward(replace(alone, actions=8), weights) == pytest.approx(1 + charged)  # it led there
+
+
 def test_an_error_has_no_reward():
     with pytest.raises(UsageError, match="server died"):
         reward(replace(REMOTE, error="server died"), PRESETS["oxe"])

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from osel_sim.cli.rollout_tables import print_rollouts, share_best
 from osel_sim.core.errors import DataError, UsageError
-from osel_sim.formats.rollout_log import SCHEMA_VERSION, Row, read_rollouts, schema, write_rollouts
+from osel_sim.formats.rollout_log import Row, read_rollouts, schema, write_rollouts
 from osel_sim.formats.shards import SHARDS, Shards
 from osel_sim.selection.reward import RewardWeights, preset, reward, row_rewards
 
@@ -101,7 +101,7 @@ def test_wrong_logs_are_refused(tmp_path):
     with pytest.raises(DataError, match="not a Parquet file"):
         read_rollouts(tmp_path)
     pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), tmp_path / "rollouts.parquet")
-    with pytest.raises(DataError, match="schema_version must be 1 to 3, got None"):
+    with pytest.raises(DataError, match="schema_version must be 1 to 4, got None"):
         read_rollouts(tmp_path)
 
 
@@ -115,8 +115,8 @@ def test_a_log_of_version_1_is_read_without_scores_and_axes(tmp_path):
     pyarrow.parquet.write_table(old.append_column("score", [[0.5, 0.25]]), file)
     with pytest.raises(DataError, match="columns must be"):
         read_rollouts(tmp_path)
-    pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"4"}), file)
-    with pytest.raises(DataError, match="schema_version must be 1 to 3, got 4"):
+    pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"5"}), file)
+    with pytest.raises(DataError, match="schema_version must be 1 to 4, got 5"):
         read_rollouts(tmp_path)
     pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"3 or so"}), file)
     with pytest.raises(DataError, match="metadata cannot be read"):
@@ -127,8 +127,8 @@ def test_a_log_of_several_robots_says_which(tmp_path):
     rows = [row(), row(1), row(2, instance="pick_place/test/0/2-UR5e", robot="UR5e")]
     write_rollouts(tmp_path, rows, {})
     table = pyarrow.parquet.read_table(tmp_path / "rollouts.parquet")
-    assert table.schema.names == [*COLUMNS, "robot"] == schema().names
-    assert table.schema.metadata[b"osel_sim.schema_version"] == str(SCHEMA_VERSION).encode() == b"3"
+    assert table.schema.names == [*COLUMNS, "robot"] == schema(3).names
+    assert table.schema.metadata[b"osel_sim.schema_version"] == b"3"
     assert table["robot"].to_pylist() == [None, None, "UR5e"]
     assert read_rollouts(tmp_path)[0] == rows
 

@@ -79,8 +79,8 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
             rows += [_row(decisions[number], policy, outcome) for policy, outcome in _others(data, folder, number)]
     keys = [instance.key for instance in instances]
     identity, contexts = read_contexts(folder, keys, encoder or configuration.get("encoder"))
-    arrays, errors = dense(folder, rows, keys, policies)
-    outcomes = LoggedOutcomes(folder, instances, tuple(policies), contexts, identity, **arrays, errors=errors, metadata=configuration, skills=None)
+    arrays = dense(folder, rows, keys, policies)
+    outcomes = LoggedOutcomes(folder, instances, tuple(policies), contexts, identity, **arrays, metadata=configuration, skills=None)
     propensities = np.array([[decision.propensities.get(policy, 0.0) for policy in policies] for decision in decisions], np.float64)
     chosen = np.array([policies.index(decision.policy) for decision in decisions], np.int64)
     return LiveLog(outcomes, chosen, propensities, str(configuration.get("selector", "unknown")), dict(configuration.get("reward", {})))

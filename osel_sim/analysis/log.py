@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts
+from osel_sim.interface.outcome import stood_in
 from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.selection.reward import RewardWeights, combined, counted_time, total_seconds
 from osel_sim.selection.skills import Skills
@@ -20,6 +21,9 @@ Half = Literal["choose", "score"]
 
 MEASURES = ("success", "subgoals", "score", "steps", "upload", "inference", "download", "motion", "price")
 """Columns of the log that are kept as arrays."""
+
+FLAGS = ("errors", "fallbacks", "solved_by_fallback")
+"""What is kept of each episode as yes or no."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +61,15 @@ class LoggedOutcomes:
         policies: (P,) names.
         contexts: float32 (N, D).
         encoder: identity of the encoder that made them.
-        success: 1 or 0 for the goal, float64 (N, P, R), like all that follow.
-        subgoals: fraction of the subgoals reached.
+        success: 1 or 0 for the goal, float64 (N, P, R), like all that follow; 0 where a fallback drove from the first call on.
+        subgoals: fraction of the subgoals reached, likewise.
         score: a graded outcome, such as minus an action MSE.
         steps: control steps.
         upload, inference, download, motion: seconds.
         price: cents.
         errors: bool (N, P, R), the episode ended in error (the rest of what is NaN never ran).
+        fallbacks: bool (N, P, R), a fallback took over.
+        solved_by_fallback: bool (N, P, R), and reached the goal; a success of the policy asked as well only if that one drove before.
         metadata: of the log.
         skills: what its policies declared, in that encoder's eyes; None where the log does not say.
     """
@@ -83,6 +89,8 @@ class LoggedOutcomes:
     motion: Array
     price: Array
     errors: NDArray[np.bool_]
+    fallbacks: NDArray[np.bool_]
+    solved_by_fallback: NDArray[np.bool_]
     metadata: dict[str, Any]
     skills: Skills | None = None
 
@@ -159,7 +167,7 @@ class LoggedOutcomes:
         """Only these instances: indices, or a bool array (N,)."""
         index = np.asarray(rows)
         index = np.flatnonzero(index) if index.dtype == bool else index.astype(np.int64)
-        arrays = {name: getattr(self, name)[index] for name in (*MEASURES, "errors", "contexts")}
+        arrays = {name: getattr(self, name)[index] for name in (*MEASURES, *FLAGS, "contexts")}
         return replace(self, instances=tuple(self.instances[row] for row in index), **arrays)
 
     def only(self, policies: Sequence[str]) -> "LoggedOutcomes":
@@ -175,7 +183,7 @@ class LoggedOutcomes:
         if not policies or len(set(policies)) < len(policies):
             raise UsageError(f"give at least one policy, each once; got {', '.join(policies) or 'none'}")
         columns = [self.policies.index(policy) for policy in policies]
-        return replace(self, policies=tuple(policies), **{name: getattr(self, name)[:, columns] for name in (*MEASURES, "errors")})
+        return replace(self, policies=tuple(policies), **{name: getattr(self, name)[:, columns] for name in (*MEASURES, *FLAGS)})
 
 
 def mean_over_repeats(values: Array) -> Array:
@@ -207,11 +215,9 @@ def read_log(folder: Path, encoder: str | None = None) -> LoggedOutcomes:
     policies = tuple(dict.fromkeys([*(named if isinstance(named, list) else []), *(row.policy for row in rows)]))
     policies = tuple(name for name in policies if name in {row.policy for row in rows})
     identity, contexts = read_contexts(folder, tuple(instances), encoder or metadata.get("encoder"))
-    arrays, errors = dense(folder, rows, tuple(instances), policies)
+    arrays = dense(folder, rows, tuple(instances), policies)
     skills = read_skills(folder, identity, metadata.get(DECLARED))
-    return LoggedOutcomes(
-        folder, named_robots(instances.values()), policies, contexts, identity, **arrays, errors=errors, metadata=metadata, skills=skills
-    )
+    return LoggedOutcomes(folder, named_robots(instances.values()), policies, contexts, identity, **arrays, metadata=metadata, skills=skills)
 
 
 def named_robots(instances: Iterable[LoggedInstance]) -> tuple[LoggedInstance, ...]:
@@ -270,8 +276,8 @@ def read_skills(folder: Path, encoder: str, declared: Any) -> Skills | None:
     return Skills(examples, {policy: tuple(names) for policy, names in declared.items()})
 
 
-def dense(source: Path, rows: Sequence[Row], instances: Sequence[str], policies: Sequence[str]) -> tuple[dict[str, Array], NDArray[np.bool_]]:
-    """Rows as one (N, P, R) array a measure, and where they ended in error.
+def dense(source: Path, rows: Sequence[Row], instances: Sequence[str], policies: Sequence[str]) -> dict[str, Any]:
+    """Rows as one (N, P, R) array a measure and a flag.
 
     Raises:
         DataError: an outcome twice, or a number that is NaN, infinite or of the wrong sign.
@@ -281,24 +287,26 @@ def dense(source: Path, rows: Sequence[Row], instances: Sequence[str], policies:
     at_repeat = {number: index for index, number in enumerate(sorted({row.repeat for row in rows}))}
     shape = (len(instances), len(policies), len(at_repeat))
     arrays = {name: np.full(shape, np.nan) for name in MEASURES}
-    errors, seen = np.zeros(shape, bool), np.zeros(shape, bool)
+    flags, seen = {name: np.zeros(shape, bool) for name in FLAGS}, np.zeros(shape, bool)
     for row in rows:
         place = at_instance[row.instance], at_policy[row.policy], at_repeat[row.repeat]
         if seen[place]:
             raise DataError(f"{source / ROLLOUTS}: instance {row.instance!r}, policy {row.policy!r}, repeat {row.repeat} is there twice")
         seen[place] = True
+        flags["fallbacks"][place] = row.fallback is not None
         if row.error is not None:
-            errors[place] = True
+            flags["errors"][place] = True
             continue
+        flags["solved_by_fallback"][place] = row.fallback is not None and row.success
         for name in MEASURES:
             value = getattr(row, name)
             if value is None:
                 continue
-            number = float(value)
+            number = 0.0 if name in ("success", "subgoals") and stood_in(row) else float(value)
             if not np.isfinite(number) or (number < 0.0 and name not in ("subgoals", "score")):
                 raise DataError(f"{source / ROLLOUTS}: instance {row.instance!r}, policy {row.policy!r}: {name} is {number}")
             arrays[name][place] = number
-    return arrays, errors
+    return {**arrays, **flags}
 
 
 def _instance(row: Row) -> LoggedInstance:

@@ -21,7 +21,8 @@ class PolicyResult:
         group: the task, or `all`.
         instances: on which it has a valid outcome.
         episodes, errors: valid ones, and those that ended in error (never counted as failures).
-        success: share of the instances solved.
+        fallbacks, solved_by_fallback: episodes in which a fallback took over, and those of them that it solved.
+        success: share of the instances solved, those left out that a fallback solved from the first call on.
         subgoals, score, reward, steps, seconds, price: means; price in cents.
     """
 
@@ -30,6 +31,8 @@ class PolicyResult:
     instances: int
     episodes: int
     errors: int
+    fallbacks: int
+    solved_by_fallback: int
     success: Estimate | None
     subgoals: Estimate | None
     score: Estimate | None
@@ -65,6 +68,8 @@ def per_group(log: LoggedOutcomes, weights: RewardWeights, attribute: str = "tas
             int(np.isfinite(log.success[rows, column]).any(axis=-1).sum()),
             int(np.isfinite(log.success[rows, column]).sum()),
             int(log.errors[rows, column].sum()),
+            int(log.fallbacks[rows, column].sum()),
+            int(log.solved_by_fallback[rows, column].sum()),
             rate_of(log.success[rows, column]),
             *(mean_of(mean_over_repeats(values[rows, column])) for values in (log.subgoals, log.score, rewards, log.steps, seconds, log.price)),
         )

@@ -207,12 +207,13 @@ def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
     """Record what is not there yet, with a progress bar, and add it. Returns how many episodes, and the seconds they took."""
     from osel_sim.core.progress import progress
     from osel_sim.episodes.workers import record as record_episodes
+    from osel_sim.interface.outcome import credited
 
     plan, missing = recording.plan, recording.missing()
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
     unit = "episode" if left else "context"
     start = time.perf_counter()
-    done = successes = 0
+    done, successes = 0, 0.0
     with progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar:
         for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers):  # contexts alone need no policy
             if recorded is None:
@@ -223,6 +224,6 @@ def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
                 bar.update()
                 continue
             done += len(rows)
-            successes += sum(row.success for row in rows)
+            successes += sum(credited(row, "success") for row in rows)
             bar.note(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h")
     return done, time.perf_counter() - start

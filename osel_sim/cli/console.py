@@ -41,7 +41,7 @@ def run_table(summary: dict[str, Any]) -> Table:
     """The selector, each policy where it was chosen, and with a counterfactual what could have been."""
     table = Table(title=f"{summary['task']}: {summary['decisions']} decisions", title_justify="left")
     table.add_column("")
-    for heading in ("decisions", "mean reward", "success [95%]", "steps", "seconds", "price (cents)", "fallbacks", "errors"):
+    for heading in ("decisions", "mean reward", "success [95%]", "steps", "seconds", "price (cents)", "fallbacks", "solved by them", "errors"):
         table.add_column(heading, justify="right")
     parts = [(f"[bold]{summary['selector']}[/bold]", summary), *((f"  chose {name}", part) for name, part in summary["policies"].items())]
     for name, part in parts:
@@ -54,6 +54,7 @@ def run_table(summary: dict[str, Any]) -> Table:
             number(part["mean_seconds"], 2),
             number(part["price"]),
             str(part["fallbacks"]),
+            str(part["solved_by_fallback"]),
             str(part["errors"]),
         )
     if "regret" in summary:

@@ -11,6 +11,7 @@ from rich.table import Table
 from osel_sim.cli.console import number, percent
 from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import Row
+from osel_sim.interface.outcome import credited
 from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.selection.reward import RewardWeights, row_rewards, row_seconds
 from osel_sim.statistics.best import share_of_best
@@ -69,7 +70,7 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
     seconds, rewards = row_seconds(rows), row_rewards(rows, weights)
     timed = bool(np.isfinite(seconds).any())
     headings = ["episodes", "success [95%]", *(heading for heading, _ in optional.values()), *(["seconds"] if timed else [])]
-    for heading in (*headings, "mean reward", "best on", "fallbacks", "errors"):
+    for heading in (*headings, "mean reward", "best on", "fallbacks", "solved by them", "errors"):
         table.add_column(heading, justify="right")
     best = share_best(rows, policies, weights)
     for policy in policies:
@@ -86,6 +87,7 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
             number(_mean(rewards[counted]), 3),
             percent(best.get(policy)),
             str(sum(row.fallback is not None for row in own)),
+            str(sum(row.fallback is not None and row.success for row in valid)),
             str(len(own) - len(valid)),
         )
     return table
@@ -124,10 +126,10 @@ def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
 def _rate(valid: Sequence[Row]) -> str:
     if not valid:
         return "-"
-    by_instance: dict[str, list[bool]] = defaultdict(list)
+    by_instance: dict[str, list[float]] = defaultdict(list)
     for row in valid:
-        by_instance[row.instance].append(row.success)
-    rate = sum(row.success for row in valid) / len(valid)
+        by_instance[row.instance].append(credited(row, "success"))
+    rate = sum(sum(successes) for successes in by_instance.values()) / len(valid)
     trials = effective_trials([float(np.mean(successes)) for successes in by_instance.values()], len(valid))
     return percent(rate, wilson_interval(min(rate * trials, trials), trials))
 

@@ -102,7 +102,7 @@ def run_episode(
             that is [-1, 1]), >= 0. Without it an episode differs from its repeat in the network's delays at most, and a local policy's not at all.
 
     Returns:
-        the outcome. `calls` and `actions` are the driver's own; `price` and `seconds` contain the fallback's.
+        the outcome. `calls` and `actions` are the driver's own; `price` and `seconds` contain the fallback's, `fallback_steps` says how far it drove.
     """
     noise = _Noise(action_noise, env.specification.action, (*episode_seed(instance.key, driver.spec.name, repeat), 1))
     episode = _Episode(env, instance, subscribers, noise)
@@ -111,7 +111,7 @@ def run_episode(
     try:
         failure = episode.drive(driver, episode_seed(instance.key, driver.spec.name, repeat))
         if failure is not None and fallback is not None:
-            fallback_reason = failure
+            fallback_reason, episode.handed_over = failure, env.steps
             failure = episode.drive(fallback, episode_seed(instance.key, fallback.spec.name, repeat))
         error = None if failure is None else f"{episode.policy}: {failure}"
     except Exception as problem:
@@ -165,6 +165,7 @@ class _Episode:
         self.tallies: list[_Tally] = []  # the driver's, then the fallback's
         self.upload = self.inference = self.download = 0.0
         self.telling = False  # a subscriber has the word
+        self.handed_over: int | None = None  # control steps when the fallback took over
 
     def drive(self, driver: Driver, seed: tuple[int, ...]) -> str | None:
         """Let one policy act until the episode is over. Returns why a call of it failed, or None."""
@@ -202,6 +203,7 @@ class _Episode:
             price=sum((tally.price for tally in self.tallies), 0.0),
             fallback=fallback,
             error=error,
+            fallback_steps=None if self.handed_over is None else int(self.env.steps) - self.handed_over,
         )
 
     def _count(self, call: Call) -> None:

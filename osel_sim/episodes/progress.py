@@ -7,6 +7,7 @@ from typing import override
 from osel_sim.core.progress import Bar, progress
 from osel_sim.episodes.run_subscribers import Run, RunSubscriber
 from osel_sim.formats.journal import Decision
+from osel_sim.interface.outcome import credited
 
 
 class Progress(RunSubscriber):
@@ -45,7 +46,7 @@ class Progress(RunSubscriber):
 
     def _words(self) -> str:
         rewards = [decision.reward for decision in self._seen if decision.reward is not None]
-        successes = [decision.success for decision in self._seen if decision.error is None]
+        successes = [credited(decision, "success") for decision in self._seen if decision.error is None]
         shares = (f"{name} {100 * sum(decision.policy == name for decision in self._seen) / len(self._seen):.0f}%" for name in self._policies)
         mean = (f"reward {sum(rewards) / len(rewards):.3f}, success {100 * sum(successes) / len(successes):.0f}%",) if rewards else ()
         return ", ".join((*mean, *shares))

@@ -8,6 +8,7 @@ from typing import Any, override
 from osel_sim.core.errors import UsageError
 from osel_sim.episodes.run_subscribers import Run, RunSubscriber
 from osel_sim.formats.journal import Decision
+from osel_sim.interface.outcome import credited
 
 FOLDER = "tensorboard"
 
@@ -28,7 +29,7 @@ class TensorBoard(RunSubscriber):
     def __init__(self) -> None:
         self._writer: Any = None
         self._policies: list[str] = []
-        self._reward, self._success, self._valid, self._regret = 0.0, 0, 0, 0.0
+        self._reward, self._success, self._valid, self._regret = 0.0, 0.0, 0, 0.0
 
     @override
     def on_start(self, run: Run) -> None:
@@ -57,9 +58,10 @@ class TensorBoard(RunSubscriber):
         if decision.error is None and decision.reward is not None:
             self._valid += 1
             self._reward += decision.reward
-            self._success += decision.success
+            success = credited(decision, "success")
+            self._success += success
             scalars |= {
-                **{"decision/reward": decision.reward, "decision/success": float(decision.success), "decision/steps": float(decision.steps)},
+                **{"decision/reward": decision.reward, "decision/success": success, "decision/steps": float(decision.steps)},
                 **{"decision/seconds": decision.seconds.motion, "decision/price": decision.price},
                 **{"mean/reward": self._reward / self._valid, "mean/success": self._success / self._valid},
             }

@@ -185,4 +185,5 @@ def make_row(instance: Instance, policy: str, repeat: int, outcome: Outcome) -> 
         error=outcome.error,
         axes=instance.axes,
         robot=instance.other_robot,
+        fallback_steps=outcome.fallback_steps,
     )

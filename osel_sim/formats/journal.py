@@ -25,7 +25,7 @@ class Decision:
         index: 0, 1, 2 ... without gaps.
         propensities: probability of each policy when this one was chosen.
         reward: None when the outcome is an error; nothing is learnt from it then.
-        robot: the robot's name, None for the usual one: then it is not written down.
+        robot: the robot's name, None for the usual one: then it is not written down, as `fallback_steps` is not where no fallback took over.
         Others: of the instance and of `Outcome`.
     """
 
@@ -52,13 +52,12 @@ class Decision:
     fallback: str | None
     error: str | None
     robot: str | None = None
+    fallback_steps: int | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As the journal has it."""
         data = dataclasses.asdict(self)
-        if self.robot is None:
-            del data["robot"]
-        return data
+        return {key: value for key, value in data.items() if value is not None or key not in ("robot", "fallback_steps")}
 
     @property
     def outcome(self) -> Outcome:

@@ -48,6 +48,8 @@ class Remote:
     """`blocking` (hold still until the answer is there) or `async` (finish the chunk at hand meanwhile)."""
     deadline: Annotated[float, between(0.001, 3600.0)] = 2.0
     """Seconds on the virtual clock after which a call is given up."""
+    timeout: Annotated[float, between(0.1, 3600.0)] = 30.0
+    """Real seconds that a server may take for an answer, or for a new connection."""
     fallback: str | None = None
     """Local policy that takes over then; without one it is an error outcome."""
     url: str | None = None

@@ -5,7 +5,8 @@ instance, policy, repeat. Logs from elsewhere (osel_sim.ingest) fit the same col
 
 Version 2 of the schema has two columns more. `score`: what was measured where success is a matter of degree, such as minus an action MSE; it is null
 in what this suite records. `axes`: those perturbed beyond `level`, such as `camera=2`. Version 3 has `robot`, and is written only where one is
-not the usual Panda. Logs of earlier versions are read as before, with what they lack null.
+not the usual Panda; version 4 `fallback_steps`, only where a fallback took over. Logs of earlier versions are read as before, with what they lack
+null.
 """
 
 import json
@@ -22,8 +23,8 @@ from osel_sim.interface.outcome import Outcome, Seconds
 if TYPE_CHECKING:
     import pyarrow
 
-SCHEMA_VERSION = 3
-_COLUMNS_ADDED = {2: ("score", "axes"), 3: ("robot",)}
+SCHEMA_VERSION = 4
+_COLUMNS_ADDED = {2: ("score", "axes"), 3: ("robot",), 4: ("fallback_steps",)}
 """Columns that came with a version; logs of an earlier one are read without them."""
 ROLLOUTS = "rollouts.parquet"
 DECLARED = "skills"
@@ -74,6 +75,7 @@ class Row:
     score: float | None = None
     axes: str | None = None
     robot: str | None = None
+    fallback_steps: int | None = None
 
     @property
     def outcome(self) -> Outcome:
@@ -113,8 +115,9 @@ def write_rollouts(folder: Path, rows: Iterable[Row], metadata: dict[str, Any]) 
     import pyarrow.parquet
 
     rows = list(rows)
-    # A log of the usual robot alone stays one that earlier versions of osel_sim read.
-    version = SCHEMA_VERSION if any(row.robot is not None for row in rows) else 2
+    # A log of the usual robot alone, without fallbacks, stays one that earlier versions of osel_sim read.
+    needed = (since for since, names in _COLUMNS_ADDED.items() if any(getattr(row, name) is not None for row in rows for name in names))
+    version = max([2, *needed])
     extra = {**metadata, "schema_version": version}
     annotated = schema(version).with_metadata(
         {_PREFIX + key.encode(): json.dumps(value, sort_keys=True).encode() for key, value in sorted(extra.items())}

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from osel_sim.formats.journal import Decision
+from osel_sim.interface.outcome import credited
 from osel_sim.statistics.intervals import wilson_interval
 
 
@@ -11,7 +12,8 @@ def summarise(decisions: Sequence[Decision], policies: Sequence[str], selector: 
     """Means over the decisions with a valid outcome; those that ended in error are counted apart, never as failures.
 
     Returns:
-        selector, decisions, errors, fallbacks, mean_reward, success_rate (with its 95 % Wilson interval), mean_steps, mean_seconds, price (mean, in
+        selector, decisions, errors, fallbacks (episodes in which one took over), solved_by_fallback (those of them that succeeded), mean_reward,
+        success_rate (with its 95 % Wilson interval; without what a fallback solved from the first call on), mean_steps, mean_seconds, price (mean, in
         cents an episode), and under `policies` the same for the decisions each policy was chosen for. A mean over nothing is null.
     """
     return {
@@ -23,13 +25,15 @@ def summarise(decisions: Sequence[Decision], policies: Sequence[str], selector: 
 
 def _part(decisions: Sequence[Decision]) -> dict[str, Any]:
     valid = [decision for decision in decisions if decision.error is None]
-    successes = sum(decision.success for decision in valid)
+    successes = [credited(decision, "success") for decision in valid]
+    fallbacks = [decision for decision in decisions if decision.fallback is not None]
     return {
         "decisions": len(decisions),
         "errors": len(decisions) - len(valid),
-        "fallbacks": sum(decision.fallback is not None for decision in decisions),
-        "success_rate": _mean([float(decision.success) for decision in valid]),
-        "success_interval": list(wilson_interval(successes, len(valid))),
+        "fallbacks": len(fallbacks),
+        "solved_by_fallback": sum(decision.success and decision.error is None for decision in fallbacks),
+        "success_rate": _mean(successes),
+        "success_interval": list(wilson_interval(sum(successes), len(valid))),
         "mean_reward": _mean([decision.reward for decision in valid if decision.reward is not None]),
         "mean_steps": _mean([float(decision.steps) for decision in valid]),
         "mean_seconds": _mean([decision.seconds.motion for decision in valid]),

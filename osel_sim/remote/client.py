@@ -26,6 +26,14 @@ MAX_ANSWER = 16 << 20  # bytes; a chunk of 1,000 actions has 56,000
 CLOSE_SECONDS = 1.0
 
 
+class HungUpError(RemoteError):
+    """The connection ended: the server may be there all the same, behind a new one."""
+
+
+class NoAnswerError(RemoteError):
+    """Nothing came, or went, in time: the server takes long, or something between has dropped the connection without a word."""
+
+
 @dataclass(frozen=True)
 class Answer:
     """What came back for one observation.
@@ -199,7 +207,9 @@ class RemoteClient:
             self._connection.send(frame)
         except ConnectionClosed as error:
             full = isinstance(error.__cause__, BlockingIOError)  # what SO_SNDTIMEO makes of a full buffer
-            raise self._fail(f"took no message within {self._timeout:g} s" if full else f"closed the connection ({error})") from None
+            if full:
+                raise self._fail(f"took no message within {self._timeout:g} s", NoAnswerError) from None
+            raise self._fail(f"closed the connection ({error})", HungUpError) from None
         return self._decode(self._receive(end), "answer"), len(frame)
 
     def _receive(self, end: float) -> str | bytes:
@@ -208,9 +218,9 @@ class RemoteClient:
         try:
             return self._connection.recv(timeout=max(0.001, end - time.monotonic()))
         except TimeoutError:
-            raise self._fail(f"no answer within {self._timeout:g} s") from None
+            raise self._fail(f"no answer within {self._timeout:g} s (timeout under [remote] allows more)", NoAnswerError) from None
         except (ConnectionClosed, OSError) as error:
-            raise self._fail(f"closed the connection ({error})") from None
+            raise self._fail(f"closed the connection ({error})", HungUpError) from None
 
     def _decode(self, frame: str | bytes, what: str) -> Any:
         if isinstance(frame, str):
@@ -222,9 +232,9 @@ class RemoteClient:
         except ProtocolError as error:
             raise self._fail(f"its {what} is unreadable: {error}") from None
 
-    def _fail(self, reason: str) -> RemoteError:
+    def _fail(self, reason: str, kind: type[RemoteError] = RemoteError) -> RemoteError:
         self.close()
-        return RemoteError(f"{self.url}: {reason}")
+        return kind(f"{self.url}: {reason}")
 
 
 def _cameras(observation: Observation) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Observation
 from osel_sim.policy.environment_fit import check_environment
 from osel_sim.policy.mapping import message_of
-from osel_sim.remote.client import Answer, RemoteClient
+from osel_sim.remote.client import Answer, HungUpError, NoAnswerError, RemoteClient
 from osel_sim.remote.network import Delays, NetworkModel, NetworkProfile, profile
 from osel_sim.remote.process import PolicyServerProcess
 from osel_sim.remote.protocol import STATE, TOKEN_VARIABLE, Greeting, example_observation, select_observation
@@ -26,6 +26,9 @@ class RemotePolicy:
     A call whose virtual time passes the deadline failed: the robot waited for as long as the deadline and has nothing. It failed because of an
     `outage` if it would have been in time without one. A server that is dead or breaks the protocol looks the same from the robot: nothing until the
     deadline. After that the rest of the episode's calls fail as well; the next `reset` tries again.
+
+    A connection that was idle between two episodes may be dead by then, because of a proxy, or because the server was started again: where the first
+    call of an episode meets such a one, it is made again, once, on a new connection. Later in an episode the server may have lost what it knew of it.
 
     Args:
         spec: a policy file with a `[remote]` table.
@@ -46,20 +49,21 @@ class RemotePolicy:
         self._profile = network or profile(spec.remote.network)
         self._network = NetworkModel(self._profile, ())
         self._broken: str | None = "no episode was started"
+        self._instruction = ""
+        self._kept = self._begun = False  # the connection is older than the episode; a call of the episode was answered
 
     def reset(self, instruction: str, seed: tuple[int, ...]) -> None:
         """Start a new episode, on a new connection if the last one broke. A server that cannot be reached makes the calls fail, not this."""
         self._network = NetworkModel(self._profile, seed)
-        self._broken = None
-        may_be_stale = self._client.connected or self._server is not None
+        self._broken, self._instruction = None, instruction
+        self._kept, self._begun = self._client.connected, False
         try:
             try:
                 self._client.reset(instruction)
             except RemoteError:
-                if not may_be_stale:
+                if not self._kept and self._server is None:
                     raise
-                self._replace_client()
-                self._client.reset(instruction)
+                self._start_over()
         except RemoteError as error:
             self._broken = self._reason(error)
 
@@ -87,36 +91,48 @@ class RemotePolicy:
         if self._server is not None:
             self._server.close()
 
-    def _replace_client(self) -> None:
-        """After a failed reset: a fresh connection, and a fresh server where it is ours, dead or hanging alike."""
+    def _start_over(self) -> None:
+        """Begin the episode again on a fresh connection, and with a fresh server where it is ours, dead or hanging alike."""
+        self._kept = False
         self._client.close()
         if self._server is not None:
             self._server.close()
             self._client = self._server.start_client()
+        self._client.reset(self._instruction)
 
     def _ask(self, observation: Observation) -> Answer | None:
         if self._broken is not None:
             return None
+        seen = select_observation(observation, self._spec.cameras, STATE in observation)
         try:
-            return self._client.act(select_observation(observation, self._spec.cameras, STATE in observation))
+            try:
+                answer = self._client.act(seen)
+            except (HungUpError, NoAnswerError) as error:
+                if self._begun or (isinstance(error, NoAnswerError) and not self._kept):  # a new connection that is silent is not dead
+                    raise
+                self._start_over()
+                answer = self._client.act(seen)
         except RemoteError as error:
             self._broken = self._reason(error)
             return None
+        self._begun = True
+        return answer
 
     def _reason(self, error: RemoteError) -> str:
         # Without the address: a server of ours has another port each time, and a journal must not.
         return str(error).removeprefix(f"{self._client.url}: ")
 
 
-def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float = 30.0, start_timeout: float = 120.0) -> RemotePolicy:
+def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float | None = None, start_timeout: float = 120.0) -> RemotePolicy:
     """A remote policy ready for use: connects to the `url` of its file, with the token in OSEL_SIM_TOKEN, or starts a server of its own.
 
     Close it after use.
 
     Args:
         environment: what it will drive.
-        timeout: real seconds for one answer.
-        start_timeout: real seconds for a server to load its weights, or for one that is not ours to answer its first request.
+        timeout: real seconds for one answer; None: as the policy file says.
+        start_timeout: real seconds for a server to load its weights, or for one that is not ours to answer its first request; never less than
+            for any other.
 
     Raises:
         RemoteError: the server cannot be started or reached.
@@ -125,6 +141,8 @@ def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float =
     if spec.remote is None:
         raise UsageError(f"{spec.file}: is not a remote policy")
     check_environment(spec, environment)
+    timeout = spec.remote.timeout if timeout is None else timeout
+    start_timeout = max(start_timeout, timeout)
     if spec.remote.url is not None:
         token = os.environ.get(TOKEN_VARIABLE)
         client = RemoteClient(spec.remote.url, environment, token, timeout, Greeting.of(spec, environment), spec.mapping)

@@ -12,6 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.log import Array, LoggedOutcomes
+from osel_sim.formats.journal import Decision
+from osel_sim.formats.rollout_log import Row
+from osel_sim.interface.outcome import stood_in
 from osel_sim.reporting.html_tables import digits_of, shortened
 from osel_sim.reporting.page import Episodes
 from osel_sim.selection.reward import RewardWeights
@@ -162,10 +165,19 @@ def notes_of(rows: Sequence[Any], log: LoggedOutcomes) -> dict[tuple[int, int, i
     at_instance, at_policy = ({name: index for index, name in enumerate(names)} for names in (log.keys, log.policies))
     at_repeat = {number: index for index, number in enumerate(sorted({row.repeat for row in rows}))}
     return {
-        (at_instance[row.instance], at_policy[row.policy], at_repeat[row.repeat]): {"fallback": row.fallback, "error": row.error}
+        (at_instance[row.instance], at_policy[row.policy], at_repeat[row.repeat]): note_of(row)
         for row in rows
         if (row.fallback or row.error) and row.instance in at_instance and row.policy in at_policy
     }
+
+
+def note_of(episode: Decision | Row) -> dict[str, str | None]:
+    """Why an episode fell back, how far the fallback drove, and whose its success is; and why it ended in an error."""
+    if episode.fallback is None:
+        return {"fallback": None, "error": episode.error}
+    steps = "" if episode.fallback_steps is None else f"; it drove {episode.fallback_steps} of {episode.steps} steps"
+    credit = f"; it solved the task alone, which is no success of {episode.policy}" if stood_in(episode) and episode.success else ""
+    return {"fallback": episode.fallback + steps + credit, "error": episode.error}
 
 
 def _number(value: float, digits: int) -> float | int | None:

@@ -18,6 +18,10 @@ from osel_sim.reporting.palette import CATEGORIES, colours
 from osel_sim.reporting.routes import WORDS, estimates, ordered
 from osel_sim.selection.reward import RewardWeights
 
+FALLBACKS = Column("fallbacks", "fallbacks"), Column("solved_by_fallback", "solved by them")
+CREDIT = "What a fallback solved from the first call on is no success of the policy."
+"""Said below tables that have these columns."""
+
 PHASES = ("upload", "inference", "download", "motion")
 _BINS = 40
 _MOST_LETTERS = 40
@@ -154,6 +158,7 @@ def _policy_table(name: str, title: str, results: Sequence[PolicyResult], log: L
     columns = [
         *(Column("group", "task" if "by_" not in name else "asked for", "text"), Column("policy", "policy", "text")),
         *(Column("instances", "instances"), Column("episodes", "episodes"), Column("errors", "errors")),
+        *(FALLBACKS if log.fallbacks.any() else ()),
         Column("success", "success", "percent"),
         *([Column("subgoals", "subgoals", "percent")] if "subgoals" in graded(log) else []),
         *([Column("score", "score", digits=None)] if "score" in graded(log) else []),
@@ -161,7 +166,7 @@ def _policy_table(name: str, title: str, results: Sequence[PolicyResult], log: L
         *(Column("seconds", "seconds"), Column("price", "price (cents)", digits=None)),
     ]
     caption = "Means with 95% intervals: Wilson's for success, in which repeats of an instance count for what they tell; for the others a bootstrap "
-    caption += "over instances. Errors count nowhere else."
+    caption += "over instances. Errors count nowhere else." + (f" {CREDIT}" if log.fallbacks.any() else "")
     return Table(name, title, caption, columns, [{column.key: getattr(result, column.key) for column in columns} for result in results])
 
 

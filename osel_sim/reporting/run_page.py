@@ -12,17 +12,17 @@ from osel_sim.analysis.clusters import score_of
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.evaluation import evaluate
 from osel_sim.analysis.live import JOURNAL, LiveLog, read_live
-from osel_sim.analysis.log import Array, LoggedOutcomes
+from osel_sim.analysis.log import FLAGS, Array, LoggedOutcomes
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, read_journal
 from osel_sim.formats.run_config import RUN
 from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, thinned
-from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes
+from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, note_of
 from osel_sim.reporting.html_tables import Cell, Column, Table, to_text
 from osel_sim.reporting.log_page import few, interval, log_sections, signed
-from osel_sim.reporting.log_sections import formula
+from osel_sim.reporting.log_sections import CREDIT, FALLBACKS, formula
 from osel_sim.reporting.off_policy_section import off_policy_table
 from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
 from osel_sim.reporting.palette import colours
@@ -154,20 +154,19 @@ def _chosen_table(run: _Run, selector: str) -> Table:
     parts = [(selector, np.ones(len(run.chosen), bool)), *((f"chose {name}", run.chosen == column) for column, name in enumerate(log.policies))]
     for name, mine in parts:
         at = np.flatnonzero(mine), run.chosen[mine]
-        own = [run.decisions[index] for index in at[0].tolist()]
         row: dict[str, Cell] = {
-            **{"who": name, "decisions": len(own), "errors": sum(item.error is not None for item in own)},
-            "fallbacks": sum(item.fallback is not None for item in own),
+            **{"who": name, "decisions": int(mine.sum())},
+            **{flag: int(getattr(log, flag)[at].sum()) for flag in FLAGS},
             **{"success": rate_of(log.success[at]), "reward": mean_of(rewards[at])},
             **{key: mean_of(values[at]) for key, values in (("steps", log.steps), ("seconds", log.seconds), ("price", log.price))},
         }
         rows.append(row)
     columns = [
-        *(Column("who", "", "text"), Column("decisions", "decisions"), Column("errors", "errors"), Column("fallbacks", "fallbacks")),
+        *(Column("who", "", "text"), Column("decisions", "decisions"), Column("errors", "errors"), *FALLBACKS),
         *(Column("success", "success", "percent"), Column("reward", "mean reward", digits=3)),
         *(Column("steps", "steps", digits=0), Column("seconds", "seconds"), Column("price", "price (cents)", digits=None)),
     ]
-    caption = "What was received, with 95% intervals; errors are no failures and count nowhere else."
+    caption = f"What was received, with 95% intervals; errors are no failures and count nowhere else. {CREDIT}"
     return Table("chosen", "What the selector received", caption, columns, rows)
 
 
@@ -234,9 +233,7 @@ def _words(value: Any) -> str:
 
 def _episodes(run: _Run, scenes: Mapping[int, bytes], beside: Path) -> Episodes:
     notes = {
-        (index, int(run.chosen[index]), 0): {"fallback": decision.fallback, "error": decision.error}
-        for index, decision in enumerate(run.decisions)
-        if decision.fallback or decision.error
+        (index, int(run.chosen[index]), 0): note_of(decision) for index, decision in enumerate(run.decisions) if decision.fallback or decision.error
     }
     videos = {}
     for index, decision in enumerate(run.decisions):

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import Row
-from osel_sim.interface.outcome import Outcome
+from osel_sim.interface.outcome import Outcome, credited
 
 Array = NDArray[np.float64]
 TimeUnit = Literal["log10-seconds", "steps"]
@@ -120,7 +120,7 @@ def total_seconds(upload: ArrayLike, inference: ArrayLike, download: ArrayLike, 
 
 
 def reward(outcome: Outcome, weights: RewardWeights) -> float:
-    """Reward of an outcome.
+    """Reward of an outcome; a success that is all a fallback's is none (`osel_sim.interface.outcome.credited`).
 
     Raises:
         UsageError: the episode ended in error, which is nobody's failure and has no reward; or S is to be a score, which no episode has.
@@ -130,7 +130,7 @@ def reward(outcome: Outcome, weights: RewardWeights) -> float:
     if weights.success == "score":
         raise UsageError("an episode has no score; S must be 'success' or 'subgoals'")
     time = counted_time(weights, outcome.steps, total_seconds(**vars(outcome.seconds)))
-    return float(combined(weights, getattr(outcome, weights.success), time, outcome.price))
+    return float(combined(weights, credited(outcome, weights.success), time, outcome.price))
 
 
 def row_seconds(rows: Sequence[Row]) -> Array:
@@ -141,7 +141,8 @@ def row_seconds(rows: Sequence[Row]) -> Array:
 def row_rewards(rows: Sequence[Row], weights: RewardWeights) -> Array:
     """Rewards of rows of a rollout log, (n,); NaN where one ended in error, or where the log lacks what the weights ask for."""
     time = counted_time(weights, _column(rows, "steps"), row_seconds(rows))
-    values = combined(weights, _column(rows, weights.success), time, _column(rows, "price"))
+    scores = _column(rows, "score") if weights.success == "score" else np.array([credited(row, weights.success) for row in rows], np.float64)
+    values = combined(weights, scores, time, _column(rows, "price"))
     return np.where([row.error is None for row in rows], values, np.nan)
 
 
