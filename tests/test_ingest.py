@@ -350,7 +350,7 @@ def test_unknown_rewards_are_dashes(tmp_path, capsys):
     text = capsys.readouterr().out
     assert "best on" in text
     line = next(line for line in text.splitlines() if line.startswith("│ a "))
-    assert [cell.strip() for cell in line.strip("│").split("│")][-5:] == ["-", "-", "0", "0", "0"]  # reward, best on, fallbacks, solved by them, errors
+    assert [cell.strip() for cell in line.strip("│").split("│")][-5:] == ["-", "-", "0", "0", "0"]  # reward, best on, fallbacks, solved, errors
 
 
 def test_bad_files_of_other_kinds(tmp_path, capsys):
