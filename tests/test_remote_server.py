@@ -12,10 +12,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from osel_sim.core.errors import PolicyError, RemoteError, UsageError
+from osel_sim.core.proxies import is_loopback
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.codec import pack, unpack
 from osel_sim.remote.protocol import RESET
-from osel_sim.remote.server import PolicyServer, is_loopback, warm_up
+from osel_sim.remote.server import PolicyServer, warm_up
 
 
 @pytest.fixture(scope="module")

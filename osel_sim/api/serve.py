@@ -58,8 +58,9 @@ def _serve(config: ServeConfig) -> None:
     spec = library.load_policy(config.policy, config.policies_dir)
     given = os.environ.get(config.token_env)
 
+    from osel_sim.core.proxies import is_loopback
     from osel_sim.policy.registry import session_factory
-    from osel_sim.remote.server import PolicyServer, is_loopback, warm_up
+    from osel_sim.remote.server import PolicyServer, warm_up
 
     if given is None and not is_loopback(config.host):
         raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")

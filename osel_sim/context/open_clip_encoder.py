@@ -5,8 +5,8 @@ import logging
 import textwrap
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from osel_sim.core.content import root
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError, nearest
-from osel_sim.core.files import file_digest
-from osel_sim.core.hub import offline_if_unreachable
+from osel_sim.core.files import file_digest, read_json
+from osel_sim.core.hub import offline_if_unreachable, why_silent
 from osel_sim.core.registry import Registry
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
 from osel_sim.interface.encoder import Context, Encoder, Image
@@ -141,8 +141,9 @@ def _create(model: str, name: str, device: str, vocabulary: str | None = None, *
     import open_clip
 
     own = {} if vocabulary is None else {"bpe_path": vocabulary}
+    may_ask = _may_ask_the_hub(model, options)
     try:
-        with _quiet(), offline_if_unreachable(), no_foreign_code():
+        with _quiet(), offline_if_unreachable() if may_ask else nullcontext(), no_foreign_code():
             loaded = open_clip.create_model(model, device=device, require_pretrained=True, weights_only=True, **options).eval()
             return loaded, open_clip.get_tokenizer(model, **own)
     except Exception as error:  # open_clip raises RuntimeError, KeyError, OSError, SafetensorError ... for what a user may get wrong
@@ -151,9 +152,24 @@ def _create(model: str, name: str, device: str, vocabulary: str | None = None, *
             raise ForeignCodeError(f"encoder {name!r}: {failed}") from None
         reason = " ".join(str(error).split()) or type(error).__name__
         raise CheckpointError(
-            f"encoder {name!r}: {textwrap.shorten(reason, 220, placeholder=' ...')}; "
+            f"encoder {name!r}: {textwrap.shorten(reason, 220, placeholder=' ...')}{why_silent() if may_ask else ''}; "
             f"without network, pass weights you have as MODEL:/path/to/weights.safetensors, or use the embedded {DEFAULT_ENCODER!r}"
         ) from None
+
+
+def _may_ask_the_hub(model: str, options: Mapping[str, Any]) -> bool:
+    """Whether anything of a model may have to come from the hub: its weights, or the text model and tokenizer that its configuration names."""
+    import open_clip
+
+    kind, _, folder = model.rpartition(":")
+    if kind == "local-dir":
+        config = read_json(Path(folder) / CONFIG).get("model_cfg")
+    elif kind or not Path(str(options.get("pretrained"))).is_file():
+        return True
+    else:
+        config = open_clip.get_model_config(model)
+    parts = config.values() if isinstance(config, dict) else ()
+    return any(str(key).startswith("hf_") and value for part in parts if isinstance(part, dict) for key, value in part.items())
 
 
 def _check_vocabulary(file: Path) -> None:

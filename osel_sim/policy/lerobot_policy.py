@@ -21,7 +21,7 @@ from torch import Tensor
 
 from osel_sim.core import content
 from osel_sim.core.errors import CheckpointError
-from osel_sim.core.hub import download, offline_if_unreachable
+from osel_sim.core.hub import download, offline_if_unreachable, why_silent
 from osel_sim.core.torch_settings import threads
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
 from osel_sim.formats.policy_file import PolicySpec
@@ -133,7 +133,7 @@ def _folder(spec: PolicySpec, checkpoint: str) -> Path:
     try:
         return download(checkpoint)
     except Exception as error:  # the hub client has its own
-        raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} cannot be read: {_line(error)}") from error
+        raise CheckpointError(f"{spec.file}: checkpoint {spec.checkpoint!r} cannot be read: {_line(error)}{why_silent()}") from error
 
 
 def _check_code(spec: PolicySpec, checkpoint: str) -> None:

@@ -1,7 +1,8 @@
 """The robot's end of the line: asks a policy server for actions, trusts nothing it says, and never waits for ever."""
 
 import contextlib
-import ipaddress
+import importlib.util
+import os
 import socket
 import struct
 import time
@@ -9,10 +10,11 @@ from dataclasses import dataclass
 from typing import Any, Self
 from urllib.parse import urlsplit
 
-from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.exceptions import ConnectionClosed, InvalidProxy, InvalidStatus, ProxyError, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.core.errors import PolicyError, RemoteError
+from osel_sim.core.proxies import Proxy, proxy_for
 from osel_sim.core.shown import shown
 from osel_sim.formats.conventions import Conventions
 from osel_sim.interface.environment import EnvironmentSpec
@@ -170,6 +172,9 @@ class RemoteClient:
 
     def _open(self) -> ClientConnection:
         headers = {"Authorization": f"Api-Key {self._token}"} if self._token else None
+        proxy = self._proxy()
+        way = f" by way of {proxy}" if proxy else ""
+        advice = f"; a server on your own network needs no proxy: {_excepting(self._address)}" if proxy else ""
         try:
             opening = connect(
                 self._address,
@@ -179,16 +184,18 @@ class RemoteClient:
                 open_timeout=self._timeout,
                 close_timeout=CLOSE_SECONDS,
                 ping_interval=None,  # a server that computes in its event loop (openpi's) answers no pings meanwhile
-                proxy=None if _is_loopback(self._address) else True,
+                proxy=proxy.address if proxy else None,
             )
             connection = self._hang_up.enter_context(opening)
         except InvalidStatus as error:
             status = error.response.status_code
             raise RemoteError(f"{self.url}: " + ("refused the token" if status in (401, 403) else f"answered HTTP {status}")) from None
         except TimeoutError:
-            raise RemoteError(f"{self.url}: no connection within {self._timeout:g} s") from None
+            raise RemoteError(f"{self.url}: no connection{way} within {self._timeout:g} s{advice}") from None
         except OSError as error:
-            raise RemoteError(f"{self.url}: cannot connect ({error.strerror or error})") from None
+            raise RemoteError(f"{self.url}: cannot connect{way} ({error.strerror or error}){advice}") from None
+        except (ProxyError, InvalidProxy) as error:
+            raise RemoteError(f"{self.url}: cannot connect{way} ({error}){advice}") from None
         except (WebSocketException, ValueError, AssertionError) as error:
             # AssertionError: websockets trips over its own close_deadline when the other side talks nonsense before the handshake is sent.
             raise RemoteError(f"{self.url}: is no WebSocket server ({str(error) or type(error).__name__})") from None
@@ -197,6 +204,20 @@ class RemoteClient:
         with contextlib.suppress(OSError):  # the server has hung up already, and its socket is closed: the next receive says so
             connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(seconds), int(fraction * 1e6)))
         return connection
+
+    def _proxy(self) -> Proxy | None:
+        """The proxy to go through.
+
+        Raises:
+            RemoteError: it wants a package that is not there.
+        """
+        proxy = proxy_for(self._address)
+        if proxy is not None and proxy.socks and importlib.util.find_spec("python_socks") is None:
+            raise RemoteError(
+                f"{self.url}: the connection would go by way of {proxy}, which needs the package python-socks[asyncio]: install it, "
+                f"or, for a server on your own network, {_excepting(self._address)}"
+            )
+        return proxy
 
     def _ask(self, message: Any) -> tuple[Any, int]:
         if self._connection is None:
@@ -241,8 +262,7 @@ def _cameras(observation: Observation) -> tuple[str, ...]:
     return tuple(key.removeprefix(IMAGES) for key in observation if key.startswith(IMAGES))
 
 
-def _is_loopback(url: str) -> bool:
-    host = urlsplit(url).hostname or ""
-    with contextlib.suppress(ValueError):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
+def _excepting(url: str) -> str:
+    """How to keep a host from the proxy."""
+    said = os.environ.get("no_proxy") or os.environ.get("NO_PROXY")
+    return f"set NO_PROXY={f'{said},' if said else ''}{urlsplit(url).hostname}"
