@@ -75,6 +75,7 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'osel_sim' has no attribute {name!r}")
+    import_module("osel_sim.core.caches").prepare()
     return getattr(import_module(f"osel_sim.{_PLACES[name]}"), name)
 
 

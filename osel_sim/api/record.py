@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from osel_sim.api.results import RecordResult
 from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Index, InstanceSettings, Names, settings
-from osel_sim.core.errors import DataError, OselError, SettingError
+from osel_sim.core.errors import DataError, SettingError
 from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
@@ -69,18 +69,43 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
 
 
 def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordResult:
-    from osel_sim.context.encoder import load_encoder
-    from osel_sim.core.files import read_json, write_json
-    from osel_sim.episodes.declared_skills import declare
-    from osel_sim.episodes.recording import Recording
-    from osel_sim.formats.run_config import RUN, check_run_folder, start_or_resume
-    from osel_sim.suites.ran_with import ran_with
+    from osel_sim.core.files import read_json
+    from osel_sim.core.holding import held, taken
+    from osel_sim.formats.rollout_log import ROLLOUTS
+    from osel_sim.formats.run_config import RUN, check_run_folder
+    from osel_sim.formats.shards import SHARDS
 
     plan = _plan(config)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
     before = read_json(folder / RUN) if config.resume and (folder / RUN).exists() else None
     known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
     check_run_folder(folder, known, config.resume)
+    with held(folder) if before is not None else taken(folder, (SHARDS, ROLLOUTS)):
+        return _record_into(folder, config, plan, configuration, known, before, encoder_given)
+
+
+def _record_into(
+    folder: Path,
+    config: RecordConfig,
+    plan: "Plan",
+    configuration: dict[str, Any],
+    known: dict[str, Any],
+    before: dict[str, Any] | None,
+    encoder_given: bool,
+) -> RecordResult:
+    """Record what is missing into a folder that this process holds.
+
+    Args:
+        configuration: as it is asked for now; `known`: as it would have been at the beginning.
+        before: the folder's `run.json`, None for a new one.
+    """
+    from osel_sim.context.encoder import load_encoder
+    from osel_sim.core.files import write_json
+    from osel_sim.episodes.declared_skills import declare
+    from osel_sim.episodes.recording import Recording
+    from osel_sim.formats.run_config import RUN, start_or_resume
+    from osel_sim.suites.ran_with import ran_with
+
     encoder = load_encoder(plan.encoder)
     skills = declare(plan.policies, encoder, plan.tasks, config.tasks)
     configuration["encoder"] = encoder.identity
@@ -96,9 +121,9 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
         write_json(folder / RUN, before | {"settings": config.to_json(), "configuration": configuration})
     try:
         done, seconds = _record_missing(recording, config.workers) if recording.missing() else (0, 0.0)
-    except OselError:
-        if not recording.grew:  # nothing came of it, such as for want of a checkpoint: the folder is as it was
-            (folder / RUN).unlink() if before is None else write_json(folder / RUN, before)
+    except BaseException:
+        if not recording.grew and before is not None:  # nothing came of it, such as for want of a checkpoint: the folder is as it was
+            write_json(folder / RUN, before)
         raise
     recording.finish(configuration)
     if lost := recording.lost:

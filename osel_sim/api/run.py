@@ -167,19 +167,31 @@ class _Run:
 
     def execute(self) -> RunResult:
         """Do it."""
-        from osel_sim.context.encoder import load_encoder
-        from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
-        from osel_sim.formats.run_config import check_run_folder, start_or_resume
-        from osel_sim.suites.ran_with import ran_with
+        from osel_sim.core.holding import held
+        from osel_sim.formats.run_config import check_run_folder
 
         config, folder = self.config, self.config.folder
         configuration = self._configuration()
         check_run_folder(folder, configuration, config.resume)
+        with contextlib.ExitStack() as holding:
+            if config.resume:
+                holding.enter_context(held(folder))
+            return self._run(folder, configuration, holding)
+
+    def _run(self, folder: Path, configuration: dict[str, Any], holding: contextlib.ExitStack) -> RunResult:
+        from osel_sim.context.encoder import load_encoder
+        from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+        from osel_sim.episodes.live import JOURNAL
+        from osel_sim.formats.run_config import start_or_resume
+        from osel_sim.suites.ran_with import ran_with
+
+        config = self.config
         encoder = load_encoder(config.encoder or DEFAULT_ENCODER)
         configuration["encoder"] = encoder.identity
         seen = self._log(config.warm_start, encoder.identity) if config.warm_start else None
         machine = ran_with(self.tasks)
 
+        from osel_sim.core.holding import taken
         from osel_sim.core.torch_settings import threads
         from osel_sim.episodes.drivers import Drivers
 
@@ -189,7 +201,9 @@ class _Run:
             selector = self._selector(encoder, configuration)
             logger.info("%s: loading %s, starting servers ...", title(self.tasks), ", ".join(spec.name for spec in self.everyone))
             drivers = stack.enter_context(Drivers(self.everyone, self.environment, self.objects))
-            # Only now, when all that could be missing is there, is the folder taken into use.
+            # Only now, when all that could be missing is there, is the folder taken into use, and given back where not even one decision comes of it.
+            if not config.resume:
+                holding.enter_context(taken(folder, (JOURNAL,)))
             for warning in start_or_resume(folder, configuration, machine, config.resume, config.to_json()):
                 logger.warning(warning)
             live = self._live(folder, encoder, drivers, selector)

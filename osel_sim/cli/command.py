@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin,
 
 from osel_sim.api.settings import MAIN, OTHER, Group, Settings
 from osel_sim.cli.output import show_log
+from osel_sim.core.caches import prepare
 from osel_sim.core.docstrings import field_docstrings
 from osel_sim.core.errors import OselError, SettingError, UnknownNameError, UsageError, did_you_mean
 from osel_sim.core.shown import shown
@@ -179,6 +180,7 @@ def reported(function: Callable[[], int]) -> int:
     """
     try:
         with show_log():
+            prepare()
             code = function()
         sys.stdout.flush()
         return code

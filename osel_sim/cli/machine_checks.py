@@ -5,13 +5,16 @@ import os
 import platform
 import shutil
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from osel_sim.core import content
-from osel_sim.core.errors import ContentError, DataError, DisplayError, OselError
+from osel_sim.core.caches import prepare
+from osel_sim.core.errors import ContentError, DataError, DisplayError, OselError, UsageError
 from osel_sim.core.files import read_json
+from osel_sim.core.proxies import settings
 from osel_sim.core.shown import shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
@@ -127,7 +130,23 @@ def _machine() -> Iterator[Check]:
     enough = memory >= MINIMUM_MEMORY
     yield Check("machine", "memory", f"{memory:.1f} GiB", OK if enough else NOTE, "" if enough else f"a run wants {MINIMUM_MEMORY:.0f} GiB")
     yield Check("machine", "free disk space here", f"{shutil.disk_usage(Path.cwd()).free / 2**30:.1f} GiB")
+    yield _caches()
+    if said := settings():
+        yield Check(
+            "machine", "proxies", ", ".join(said), NOTE, "nothing local needs the network; NO_PROXY=HOST,... excepts policy servers of your own"
+        )
     yield _gpu()
+
+
+def _caches() -> Check:
+    """Where compiled code, light meshes, models and the like are kept."""
+    try:
+        used = prepare()
+    except UsageError as error:
+        return Check("machine", "caches", str(error), MISSING, "export TMPDIR=/a/folder/that/can/be/written")
+    temporary = used.parent == Path(tempfile.gettempdir())
+    note = "the home folder cannot be written: what was compiled is lost with the temporary files; set XDG_CACHE_HOME to keep it"
+    return Check("machine", "caches", f"in {used}", NOTE if temporary else OK, note if temporary else "")
 
 
 def _gpu() -> Check:

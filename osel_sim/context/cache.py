@@ -1,5 +1,6 @@
 """Contexts on disk: `contexts.npz` beside a journal or rollout log, keyed by encoder and instance."""
 
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from osel_sim.core.arrays import read_arrays
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import atomic
 from osel_sim.interface.encoder import Context, Encoder, Image
+
+logger = logging.getLogger(__name__)
 
 FILE = "contexts.npz"
 EXAMPLE = "skill:"
@@ -25,15 +28,22 @@ class ContextCache:
     Args:
         folder: where `contexts.npz` lies or will lie.
         autosave: write the file whenever that many new contexts came in (0: only on `save`).
+        mend: begin anew, with a warning, where the file that is there is damaged: for those who can make the contexts again.
 
     Raises:
         DataError: the file that is there cannot be read or has another form.
     """
 
-    def __init__(self, folder: Path, autosave: int = 100) -> None:
+    def __init__(self, folder: Path, autosave: int = 100, mend: bool = False) -> None:
         self.file = folder / FILE
         self._autosave, self._unsaved = autosave, 0
-        self._contexts: dict[str, dict[str, Context]] = _read(self.file) if self.file.exists() else {}
+        self._contexts: dict[str, dict[str, Context]] = {}
+        try:
+            self._contexts = _read(self.file) if self.file.exists() else {}
+        except DataError as error:
+            if not mend:
+                raise
+            logger.warning("%s; its contexts are made again", error)
 
     def encoders(self) -> list[str]:
         """Identities of the encoders that have contexts here."""

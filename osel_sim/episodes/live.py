@@ -76,7 +76,7 @@ class LiveRun:
         self.folder, self.tasks, self.encoder = folder, tasks, encoder
         self.drivers, self.selector, self.options = drivers, selector, options
         self.subscribers = subscribers
-        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder)
+        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder, mend=True)
         self._journal = Lines(folder / JOURNAL)
         self.decisions = [to_decision(data, index, self._journal.file) for index, (data, _) in enumerate(self._journal.rows)]
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None

@@ -26,7 +26,7 @@ class Recording:
     def __init__(self, folder: Path, plan: Plan, encoder: str, skills: Skills | None = None) -> None:
         self.folder, self.plan, self.encoder, self.grew = folder, plan, encoder, False
         self._skills = skills
-        self._cache = ContextCache(folder, autosave=0)
+        self._cache = ContextCache(folder, autosave=0, mend=True)
         self._rows: dict[str, dict[Episode, Row]] = {}
         there, metadata = read_rollouts(folder) if (folder / ROLLOUTS).exists() else ([], {})
         self._declared, self._default = metadata.get(DECLARED), metadata.get("encoder")

@@ -88,7 +88,7 @@ class TimingFile(RunSubscriber):
 
     @override
     def on_start(self, run: Run) -> None:
-        self._lines = Lines(run.folder / TIMING, keep=len(run.decisions))
+        self._lines = Lines(run.folder / TIMING, keep=len(run.decisions), mend=True)
 
     @override
     def on_instance(self, index: int) -> None:

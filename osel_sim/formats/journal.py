@@ -5,7 +5,9 @@ order of the dataclass and floats in Python's shortest exact form, so that equal
 """
 
 import dataclasses
+import itertools
 import json
+import logging
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,6 +17,8 @@ from typing import Any
 from osel_sim.core.errors import DataError
 from osel_sim.core.shown import escaped
 from osel_sim.interface.outcome import Outcome, Seconds
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -84,11 +88,19 @@ class Lines:
 
     Args:
         keep: drop all lines after the first so many (None: keep all whole ones).
+        mend: a line that is no JSON ends what is kept, with a warning, instead of being refused: for files that no result depends on.
     """
 
-    def __init__(self, file: Path, keep: int | None = None) -> None:
+    def __init__(self, file: Path, keep: int | None = None, mend: bool = False) -> None:
         self.file = file
-        self.rows = list(read_lines(file))[:keep]
+        self.rows: list[tuple[dict[str, Any], bytes]] = []
+        try:
+            for row in itertools.islice(read_lines(file), keep):
+                self.rows.append(row)
+        except DataError as error:
+            if not mend:
+                raise
+            logger.warning("%s; that line and what follows it are dropped", error)
         good = sum(len(raw) for _, raw in self.rows)
         self._handle = file.open("r+b" if file.exists() else "w+b")
         self._handle.truncate(good)  # the torn line of a killed process, and what lies beyond `keep`

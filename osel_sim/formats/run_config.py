@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
 from osel_sim.core.files import digest, is_partial, read_json, write_json
+from osel_sim.core.holding import LOCK
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.interface.suite import Task
@@ -107,7 +108,7 @@ def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) 
         if resume:
             raise UsageError(f"--resume: there is no run in {folder}; leave --resume out to begin one, or give the folder with --out")
         check_writable(folder)
-        if folder.exists() and any(not is_partial(item) for item in folder.iterdir()):
+        if folder.exists() and any(not is_partial(item) and item.name != LOCK for item in folder.iterdir()):
             raise UsageError(f"--out {folder} is not empty and holds no {RUN}; give a new folder")
         return
     if not resume:
@@ -133,7 +134,7 @@ def check_writable(folder: Path) -> None:
 def start_or_resume(
     folder: Path, configuration: dict[str, Any], ran_with: dict[str, Any], resume: bool, settings: dict[str, Any] | None = None
 ) -> list[str]:
-    """Make the output folder with its `run.json`, or check that what is in it is the same run.
+    """Write `run.json` into an output folder that this process holds, or check that what is in it is the same run.
 
     Args:
         configuration: what came of the settings: names, digests, everything that results depend on; must be equal on resuming.
@@ -151,7 +152,6 @@ def start_or_resume(
     file = folder / RUN
     if not resume:
         try:
-            folder.mkdir(parents=True, exist_ok=True)
             given = {} if settings is None else {"settings": settings}
             write_json(file, {"schema_version": SCHEMA_VERSION, **given, "configuration": configuration, "environment": ran_with})
         except OSError as error:

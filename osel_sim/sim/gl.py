@@ -16,6 +16,7 @@ from functools import cache
 from types import ModuleType
 from typing import Any
 
+from osel_sim.core.caches import prepare
 from osel_sim.core.errors import DisplayError
 
 BACKENDS = ("cgl",) if platform.system() == "Darwin" else ("egl", "osmesa", "glfw")
@@ -113,6 +114,7 @@ def context(width: int, height: int) -> Any:
 def quiet_robosuite() -> ModuleType:
     """Import robosuite after a backend is chosen, without its start-up warnings (private macros, optional robots, old string escapes)."""
     choose_backend()
+    prepare()
     logging.getLogger("robosuite_logs").addFilter(_errors_only)
     chosen = os.environ["MUJOCO_GL"]
     try:

@@ -4,7 +4,6 @@ Decimated once with fast-simplification and kept in the user's cache folder. Mes
 same to the last bit; where a robot shows such a mesh as well, what it shows becomes a mesh of its own.
 """
 
-import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.arrays import read_arrays
+from osel_sim.core.caches import prepare
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic, content_digest
 from osel_sim.interface.robot import LightMeshes
@@ -23,9 +23,8 @@ SHOWN = "_shown"
 
 
 def cache_folder() -> Path:
-    """Where light meshes are kept: `$XDG_CACHE_HOME/osel_sim`, or under `~/.cache`."""
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "osel_sim"
+    """Where light meshes are kept: `osel_sim` among the user's caches."""
+    return prepare() / "osel_sim"
 
 
 def lighten(spec: Any, xml: str, how: LightMeshes) -> None:

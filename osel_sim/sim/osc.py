@@ -7,8 +7,9 @@ of the time (Khatib 1987 for the method).
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from osel_sim.core.compiled import njit
 
 Array = NDArray[np.float64]
 

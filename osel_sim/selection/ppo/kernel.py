@@ -12,7 +12,8 @@ layer after layer, the matrix (outputs, inputs) by rows, then the bias.
 """
 
 import numpy as np
-from numba import njit
+
+from osel_sim.core.compiled import njit
 
 BETA1, BETA2, ADAM_EPS = 0.9, 0.999, 1e-5
 """Adam's settings in SB3's PPO: torch's own decay rates, and SB3's epsilon."""
