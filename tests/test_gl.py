@@ -7,7 +7,8 @@ import pytest
 
 
 def run(code: str, **changes: str | None) -> subprocess.CompletedProcess[str]:
-    environment = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM", "OSEL_SIM_GL_CHECKED")}
+    ours = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID", "OSEL_SIM_GL_CHECKED")
+    environment = {key: value for key, value in os.environ.items() if key not in ours}
     environment.update({key: value for key, value in changes.items() if value is not None})
     return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
 
@@ -31,6 +32,7 @@ def test_what_the_environment_asks_for_is_used(backend: str) -> None:
 def test_osmesa_is_found_where_egl_does_not_work() -> None:
     done = run(CHOOSE, **NO_EGL)
     assert done.stdout.strip() == "Backend(name='osmesa', how='probed') osmesa osmesa", done.stderr
+    assert "images are drawn by osmesa instead (MUJOCO_GL=osmesa asks for it)" in done.stderr  # never in silence
 
 
 def test_without_any_backend_the_packages_are_named(tmp_path: Path) -> None:
@@ -46,6 +48,56 @@ def test_a_broken_wish_is_refused(value: str, message: str) -> None:
     done = run(CHOOSE, MUJOCO_GL=value, **NO_EGL)
     assert done.returncode != 0
     assert message in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("variables", "says"),
+    [
+        ({"PYOPENGL_PLATFORM": "osmesa"}, "Backend(name='osmesa', how='PYOPENGL_PLATFORM')"),
+        ({"PYOPENGL_PLATFORM": "egl", **NO_EGL}, "PYOPENGL_PLATFORM=egl does not work"),
+        ({"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "osmesa"}, "MUJOCO_GL=egl and PYOPENGL_PLATFORM=osmesa contradict each other"),
+        ({"MUJOCO_EGL_DEVICE_ID": "0"}, "Backend(name='egl', how='MUJOCO_EGL_DEVICE_ID')"),
+        ({"MUJOCO_EGL_DEVICE_ID": "77"}, "MUJOCO_EGL_DEVICE_ID=77: that device cannot be had (RuntimeError"),
+        ({"MUJOCO_EGL_DEVICE_ID": "cuda:0", "MUJOCO_GL": "egl"}, "MUJOCO_EGL_DEVICE_ID=cuda:0: that device cannot be had (ValueError"),
+        ({"MUJOCO_EGL_DEVICE_ID": "77", "MUJOCO_GL": "osmesa"}, "Backend(name='osmesa', how='MUJOCO_GL')"),
+    ],
+)
+def test_a_wish_is_met_or_its_variable_named(variables: dict[str, str], says: str) -> None:
+    done = run(CHOOSE, **variables)
+    assert says in done.stdout + done.stderr
+
+
+def test_robosuite_takes_an_egl_device_that_cuda_numbers_otherwise() -> None:
+    done = run(
+        "from osel_sim.sim import gl; gl.quiet_robosuite(); import os; print(os.environ['MUJOCO_EGL_DEVICE_ID'])",
+        MUJOCO_EGL_DEVICE_ID="0",
+        CUDA_VISIBLE_DEVICES="3",
+    )
+    assert done.stdout.strip() == "0", done.stderr
+
+
+FORK = """
+import os
+import numpy as np
+from osel_sim.core.errors import DisplayError
+from osel_sim.sim.env import TaskEnv
+env = TaskEnv("lift", cameras=("agentview",), image_size=32)
+before = env.reset(seed=1)[0]["observation.images.agentview"].copy()
+child = os.fork()
+try:
+    print("child" if child == 0 else "parent", np.array_equal(before, env.reset(seed=1)[0]["observation.images.agentview"]), flush=True)
+except DisplayError as error:
+    print(str(error).partition(": start")[0], flush=True)
+if child == 0:
+    os._exit(0)
+os.waitpid(child, 0)
+"""
+
+
+@pytest.mark.parametrize(("backend", "says"), [("egl", "child True"), ("osmesa", "this process was forked from one that had drawn images (osmesa)")])
+def test_a_process_may_fork_after_it_drew(backend: str, says: str) -> None:
+    done = run(FORK, MUJOCO_GL=backend)
+    assert says in done.stdout and "parent True" in done.stdout, done.stdout + done.stderr
 
 
 def test_a_child_process_does_not_probe_again() -> None:

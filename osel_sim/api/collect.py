@@ -58,6 +58,7 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
     Raises:
         OselError: whatever is wrong with the settings or what is in the folder already; the message says what.
     """
+    from osel_sim.core.holding import held
     from osel_sim.formats.levels import parse_axes, resolve
     from osel_sim.formats.run_config import robots_said
     from osel_sim.suites.registry import select_task_files
@@ -82,5 +83,6 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
         if collection.seeds(out) == config.episodes:
             done.append(f"{out} is complete")  # and stays as it is: training tells datasets apart by when their files were written, too
             continue
-        done.append(collection.collect(task, out, config.episodes, config.level, axes, config.image_size, config.workers))
+        with held(collection.shards_folder(out)):
+            done.append(collection.collect(task, out, config.episodes, config.level, axes, config.image_size, config.workers))
     return CollectResult(tuple(outs), tuple(done))

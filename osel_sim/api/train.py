@@ -1,6 +1,7 @@
 """Training of a policy from demonstrations, and of the context encoder."""
 
 import os
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,6 +11,7 @@ from pydantic import AllowInfNan
 
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Index, Names, Settings, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UnknownNameError, UsageError
+from osel_sim.core.holding import held
 from osel_sim.core.trust import trusting
 
 Minutes = Annotated[float, Ge(0.001), Le(1e5), AllowInfNan(False)]
@@ -137,7 +139,7 @@ def train(config: TrainConfig | None = None, /, **values: Any) -> tuple[Path, di
         tasks=config.tasks,
         init=config.init,
     )
-    with trusting(config.trust):
+    with trusting(config.trust), held(out) if config.resume and out.is_dir() else nullcontext():
         return out, policy_training.train(spec, recipe, config.data, options)
 
 
@@ -166,4 +168,5 @@ def train_encoder(config: EncoderTrainConfig | None = None, /, **values: Any) ->
     tasks = tuple(task.name for task in select_task_files(config.task))
     wanted = encoder_training.EncoderSettings(tasks, tuple(config.level), config.steps, config.seed, config.scenes, config.test_scenes)
     out = config.out or config.data / config.encoder
-    return out, encoder_training.train(wanted, config.data, out, config.minutes, config.device, config.resume)
+    with held(out) if config.resume and out.is_dir() else nullcontext():
+        return out, encoder_training.train(wanted, config.data, out, config.minutes, config.device, config.resume)

@@ -7,6 +7,7 @@ one line; cyclopts raises them.
 import errno
 import functools
 import inspect
+import io
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -176,8 +177,11 @@ def reported(function: Callable[[], int]) -> int:
 
     An `OselError` becomes one line `error: ...` on standard error and its exit code, likewise a file that cannot be written or a full disk; Ctrl-C
     becomes a short line and 130; a reader that has gone (`| head`) ends the command without a word. Messages of the package's logger go to standard
-    error meanwhile.
+    error meanwhile. Letters that the terminal's encoding lacks are written as escapes, such as `\\u7b56`.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         with show_log():
             prepare()

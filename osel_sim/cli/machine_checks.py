@@ -102,7 +102,7 @@ def _display() -> Iterator[Check]:
 
     try:
         backend = gl.find_backend()
-        how = "from MUJOCO_GL" if backend.how == "MUJOCO_GL" else "found by probing"
+        how = "found by probing" if backend.how == "probed" else f"from {backend.how}"
         yield Check("display", "OpenGL", f"{backend.name}, {how}, draws with {_renderer()}")
     except DisplayError as error:
         problem, _, advice = str(error).partition(". ")

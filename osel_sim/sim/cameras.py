@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
+from osel_sim.sim import forking
 from osel_sim.sim.appearance import Appearance
 from osel_sim.sim.scene import full_model
 
@@ -46,6 +47,7 @@ class Cameras:
                 f"quality must be one of {', '.join(QUALITIES)}, sizes within 1 to {LARGEST} pixels; got {quality!r}, {width} x {height}"
             )
         if quality not in self._renderers:
+            forking.holds(self)
             self._renderers[quality] = _Renderer(self._appearance if quality == "fast" else self._full_appearance(), quality)
             if len(self._renderers) == 1:
                 # mujoco takes GL down at exit, before garbage collection reaches the renderers. Last registered runs first, so register after it.

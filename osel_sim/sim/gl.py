@@ -18,6 +18,7 @@ from typing import Any
 
 from osel_sim.core.caches import prepare
 from osel_sim.core.errors import DisplayError
+from osel_sim.sim import forking
 
 BACKENDS = ("cgl",) if platform.system() == "Darwin" else ("egl", "osmesa", "glfw")
 HEADLESS = tuple(backend for backend in BACKENDS if backend != "glfw")
@@ -25,6 +26,9 @@ PACKAGES = {"egl": "libegl1 libgl1-mesa-dri", "osmesa": "libosmesa6"}
 PROBE_SECONDS = 60.0
 # Set beside MUJOCO_GL once a backend has drawn a picture, so that a child process need not try again: "<backend> <found how>".
 CHECKED = "OSEL_SIM_GL_CHECKED"
+PLATFORM, DEVICE = "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID"
+
+logger = logging.getLogger(__name__)
 
 _PROBE = """
 import mujoco
@@ -40,20 +44,21 @@ with mujoco.Renderer(model, 16, 16) as renderer:
 
 @dataclass(frozen=True)
 class Backend:
-    """A backend that has drawn a picture on this machine, and `how` it came to be used: `MUJOCO_GL` or `probed`."""
+    """A backend that has drawn a picture on this machine, and `how` it came to be used: `probed`, or the variable that asks for it."""
 
     name: str
     how: str
 
 
 def choose_backend() -> str:
-    """The GL backend to render with: `egl`, `osmesa`, or what `MUJOCO_GL` asks for.
+    """The GL backend to render with: `egl`, `osmesa`, or what the environment asks for.
 
-    `MUJOCO_GL` in the environment wins; else EGL, then OSMesa, is tried in a subprocess (about half a second each, once a run). `MUJOCO_GL` and
-    `PYOPENGL_PLATFORM` are set to the finding, for MuJoCo, robosuite and child processes.
+    `MUJOCO_GL` in the environment wins, then `PYOPENGL_PLATFORM`, then `MUJOCO_EGL_DEVICE_ID`, which only EGL has; else EGL, then OSMesa, is tried in
+    a subprocess (about half a second each, once a run), and a warning says where it is not EGL. `MUJOCO_GL` and `PYOPENGL_PLATFORM` are set to the
+    finding, for MuJoCo, robosuite and child processes.
 
     Raises:
-        DisplayError: neither works, or what `MUJOCO_GL` asks for does not; names the packages to install.
+        DisplayError: neither works, or what a variable asks for does not, or two contradict each other; names the variable, or packages to install.
     """
     return find_backend().name
 
@@ -68,12 +73,23 @@ def find_backend() -> Backend:
     checked = os.environ.get(CHECKED, "").split()
     if len(checked) == 2 and checked[0] == wanted:
         return Backend(*checked)
+    platform_wanted = os.environ.get(PLATFORM, "").strip().lower()
+    if wanted and platform_wanted in HEADLESS and platform_wanted != wanted:
+        raise DisplayError(f"MUJOCO_GL={wanted} and {PLATFORM}={platform_wanted} contradict each other: unset one of them")
     if wanted:
         return _use(wanted, "MUJOCO_GL")
-    complaints = []
+    if platform_wanted in HEADLESS:
+        return _use(platform_wanted, PLATFORM)
+    if os.environ.get(DEVICE) and "egl" in HEADLESS:
+        return _use("egl", DEVICE)
+    if platform_wanted:
+        logger.warning("%s=%s draws on a display, which nothing here needs; it is not used", PLATFORM, platform_wanted)
+    complaints: list[str] = []
     for name in HEADLESS:
         problem = probe(name)
         if problem is None:
+            if complaints:
+                logger.warning("%s; images are drawn by %s instead (MUJOCO_GL=%s asks for it)", "; ".join(complaints), name, name)
             return _remember(Backend(name, "probed"))
         complaints.append(f"{name}: {problem}")
     raise DisplayError(f"no headless OpenGL works ({'; '.join(complaints)}). {_advice(*HEADLESS)}")
@@ -105,10 +121,15 @@ def context(width: int, height: int) -> Any:
     Args:
         width: largest image to be rendered, pixels (OSMesa allocates its buffer from it).
         height: likewise.
+
+    Raises:
+        DisplayError: as `choose_backend`; or this process was forked from one that had drawn.
     """
     from importlib import import_module
 
-    return import_module(f"mujoco.{choose_backend()}").GLContext(width, height)
+    backend = choose_backend()
+    forking.drawing(backend)
+    return import_module(f"mujoco.{backend}").GLContext(width, height)
 
 
 def quiet_robosuite() -> ModuleType:
@@ -117,12 +138,15 @@ def quiet_robosuite() -> ModuleType:
     prepare()
     logging.getLogger("robosuite_logs").addFilter(_errors_only)
     chosen = os.environ["MUJOCO_GL"]
+    device = os.environ.pop(DEVICE, None)  # robosuite insists that it is one of CUDA_VISIBLE_DEVICES, which numbers devices otherwise than EGL
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             import robosuite
     finally:
         os.environ["MUJOCO_GL"] = chosen  # robosuite writes egl over glfw
+        if device is not None:
+            os.environ[DEVICE] = device
     return robosuite  # type: ignore[no-any-return]
 
 
@@ -134,9 +158,12 @@ def _use(wanted: str, how: str) -> Backend:
     if wanted not in BACKENDS:
         raise DisplayError(f"MUJOCO_GL={wanted!r} is not a rendering backend, known: {', '.join(BACKENDS)} (unset it to have one found)")
     problem = probe(wanted)
-    if problem is not None:
-        raise DisplayError(f"MUJOCO_GL={wanted} does not work ({problem}). {_advice(wanted)}, or unset MUJOCO_GL to have a backend found")
-    return _remember(Backend(wanted, how))
+    if problem is None:
+        return _remember(Backend(wanted, how))
+    device = os.environ.get(DEVICE)
+    if wanted == "egl" and device is not None:
+        raise DisplayError(f"{DEVICE}={device}: that device cannot be had ({problem}). Name another one, or unset {DEVICE} to have one found")
+    raise DisplayError(f"{how}={wanted} does not work ({problem}). {_advice(wanted)}, or unset {how} to have a backend found")
 
 
 def _remember(backend: Backend) -> Backend:
