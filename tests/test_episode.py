@@ -241,13 +241,15 @@ def test_real_time_takes_as_long_as_it_says(env, instance):
     assert time.perf_counter() - start >= outcome.seconds.motion
 
 
-def test_success_ends_the_episode_and_video_changes_nothing(task, tmp_path):
+def test_success_ends_the_episode_and_video_changes_nothing(task, tmp_path, monkeypatch):
     env = TaskEnv(task)
     instance = make_instance(task, 0)
     env.load(instance)
     start = env.snapshot()
     ends = []
-    for subscribers in ([], [Video(tmp_path / "videos" / "a.mp4", quality="fast")]):
+    monkeypatch.chdir(tmp_path)
+    folder = Path("12:30:00")  # a protocol, to ffmpeg
+    for subscribers in ([], [Video(folder / "a.mp4", quality="fast")]):
         env.restore(start)
         outcome = run_episode(env, instance, Driver(spec(execute=1), ExpertCaller(env)), subscribers=subscribers)
         ends.append((outcome, env.observe(("agentview",), 64)))
@@ -259,10 +261,10 @@ def test_success_ends_the_episode_and_video_changes_nothing(task, tmp_path):
     assert all(np.array_equal(seen[key], seen_filmed[key]) for key in seen)
     import imageio.v3
 
-    film = imageio.v3.imread(tmp_path / "videos" / "a.mp4")
+    film = imageio.v3.imread(folder.absolute() / "a.mp4")
     assert len(film) == pytest.approx(plain.steps / 2 + 11, abs=2)
     assert film[0][:80].max() > 200  # there is text
-    assert [file.name for file in (tmp_path / "videos").iterdir()] == ["a.mp4"]
+    assert [file.name for file in folder.iterdir()] == ["a.mp4"]
     env.close()
 
 

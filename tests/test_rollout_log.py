@@ -1,6 +1,7 @@
 """The rollout log: typed columns, exact values, the same bytes for the same content; shards that survive a cut."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow
@@ -291,3 +292,13 @@ def test_policies_that_come_to_the_same_share_an_instance_whatever_their_order()
     rows = [row(0, "small", price=0.0), row(0, "large"), row(2, "small"), row(2, "large")]
     for policies in (["small", "large"], ["large", "small"]):
         assert share_best(rows, policies, preset("oxe")) == {"small": 0.75, "large": 0.25}
+
+
+def test_a_folder_named_like_an_address_is_one(tmp_path, monkeypatch):
+    """To Parquet's readers `12:30/rollouts.parquet` would be a file system of the kind `12`."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("2026-11-28T09:30:00", "s3:x", "-x", "r.zip"):
+        folder = Path(name)
+        folder.mkdir()
+        write_rollouts(folder, [row()], {})
+        assert read_rollouts(folder)[0] == [row()]

@@ -62,6 +62,11 @@ def read_arrays(file: Path, what: str, content: bytes | None = None) -> dict[str
         raise DataError(f"{file}: not a file of {what} ({' '.join(str(error).split())[:200] or type(error).__name__})") from None
 
 
+def local(file: Path) -> Path:
+    """A file as Parquet's readers and writers want it: to them, a relative path that begins with `12:30/` or `a:b/` is an address."""
+    return file.absolute()
+
+
 def check_rows(file: Path) -> None:
     """Whether a Parquet file is large enough for its number of rows.
 
@@ -71,7 +76,7 @@ def check_rows(file: Path) -> None:
     """
     from pyarrow.parquet import read_metadata
 
-    rows, size = read_metadata(file).num_rows, file.stat().st_size
+    rows, size = read_metadata(local(file)).num_rows, file.stat().st_size
     if rows > max(FREE_ROWS, ROWS_A_BYTE * size):
         raise DataError(f"{file}: claims {rows} rows, a file of {size} bytes cannot hold so many")
 

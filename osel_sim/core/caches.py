@@ -13,7 +13,6 @@ import tempfile
 from pathlib import Path
 
 from osel_sim.core.errors import UsageError
-from osel_sim.core.files import can_write
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +48,7 @@ def prepare() -> Path:
         UsageError: not even temporary files can be written; or NUMBA_CACHE_DIR, which numba insists on, cannot.
     """
     own, compiled = folder(), os.environ.get("NUMBA_CACHE_DIR")
-    if compiled and not can_write(Path(compiled)):
+    if compiled and not _usable(Path(compiled)):
         raise UsageError(f"NUMBA_CACHE_DIR={compiled} cannot be written, and compiled code is kept there: name another folder, or unset it")
     try:
         temporary = Path(tempfile.gettempdir())
@@ -57,7 +56,7 @@ def prepare() -> Path:
         raise UsageError(f"no folder for temporary files can be written ({error.strerror or error}): name one in TMPDIR") from None
     if _name() is None:
         os.environ["USER"] = f"uid{os.getuid()}"  # torch asks for one, to name its folder
-    if own is not None and can_write(own):
+    if own is not None and _usable(own):
         return own
     base = _temporary(temporary)
     logger.info("caches: %s cannot be written, they are kept in %s (XDG_CACHE_HOME names another folder)", own or "the home folder", base)
@@ -77,9 +76,19 @@ def _temporary(place: Path) -> Path:
     base = place / f"osel_sim-{os.getuid()}"
     base.mkdir(mode=0o700, exist_ok=True)
     found = base.lstat()
-    if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022 and can_write(base):
+    if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022 and _usable(base):
         return base
     return Path(tempfile.mkdtemp(prefix="osel_sim-"))
+
+
+def _usable(folder: Path) -> bool:
+    """Whether a folder is there, or can be made, and be written into: tried, since permissions do not tell all."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
 
 
 def _name() -> str | None:

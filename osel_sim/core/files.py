@@ -73,12 +73,6 @@ def atomic_files(folder: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def can_write(folder: Path) -> bool:
-    """Whether a folder can be written into, or made."""
-    there = next((path for path in (folder, *folder.absolute().parents) if os.path.lexists(path)), folder)
-    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
-
-
 def is_partial(path: Path) -> bool:
     """Whether a path is what a killed process left of a file or folder that it was writing."""
     return path.name.startswith(".") and path.name.endswith(_PARTIAL)

@@ -1,13 +1,15 @@
 """Videos: what the camera saw, with instruction, policy, step and price written into the frame."""
 
 import textwrap
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, override
 
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.errors import UsageError
 from osel_sim.core.files import atomic
 from osel_sim.episodes.loop import Frame, Subscriber
 from osel_sim.interface.outcome import Outcome
@@ -49,7 +51,7 @@ class Video(Subscriber):
         self._fps = specification.control_hz / self._every
         self.file.parent.mkdir(parents=True, exist_ok=True)
         self._writer = imageio_ffmpeg.write_frames(
-            str(self._file.enter_context(atomic(self.file))),
+            f"file:{self._file.enter_context(atomic(self.file.absolute()))}",  # else `12:30/0.mp4` is a protocol to ffmpeg, and `-x/0.mp4` an option
             (SIZE, SIZE + _BAND),
             fps=self._fps,
             codec="libx264",
@@ -58,7 +60,8 @@ class Video(Subscriber):
             output_params=["-f", "mp4"],
             ffmpeg_log_level="error",
         )
-        self._writer.send(None)
+        with self._named():
+            self._writer.send(None)
         self._show(frame)
 
     @override
@@ -75,7 +78,8 @@ class Video(Subscriber):
         self._show(self._last, outcome)
         for _ in range(int(HOLD_SECONDS * self._fps) - 1):
             self._send(self._image)
-        self._writer.close()
+        with self._named():
+            self._writer.close()
         self._file.close()
 
     def _show(self, frame: Frame, outcome: Outcome | None = None) -> None:
@@ -86,7 +90,16 @@ class Video(Subscriber):
 
     def _send(self, image: NDArray[np.uint8]) -> None:
         if self._writer is not None:
-            self._writer.send(image)
+            with self._named():
+                self._writer.send(image)
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        """What goes wrong in ffmpeg, as one line about the video."""
+        try:
+            yield
+        except (OSError, RuntimeError) as error:
+            raise UsageError(f"{self.file}: ffmpeg cannot write the video ({' '.join(str(error).split())[:200]})") from None
 
 
 def annotate(picture: NDArray[np.uint8], frame: Frame, outcome: Outcome | None = None) -> NDArray[np.uint8]:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.core.arrays import check_rows
+from osel_sim.core.arrays import check_rows, local
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic
 from osel_sim.interface.outcome import Outcome, Seconds
@@ -125,7 +125,7 @@ def write_rollouts(folder: Path, rows: Iterable[Row], metadata: dict[str, Any]) 
     table = pyarrow.Table.from_pylist([vars(row) for row in rows], schema=annotated)
     file = folder / ROLLOUTS
     with atomic(file) as partial:
-        pyarrow.parquet.write_table(table, partial, compression="zstd")
+        pyarrow.parquet.write_table(table, local(partial), compression="zstd")
     return file
 
 
@@ -145,7 +145,7 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
             "the same command goes on with an interrupted one"
         )
     try:
-        found = pyarrow.parquet.read_schema(file)
+        found = pyarrow.parquet.read_schema(local(file))
         check_rows(file)
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(f"{file} is not a Parquet file ({error})") from None
@@ -162,7 +162,7 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
         raise DataError(f"{file}: columns must be {', '.join(columns)}; got {', '.join(found.names)}")
     _check_types(file, found)
     try:
-        table = pyarrow.parquet.read_table(file)
+        table = pyarrow.parquet.read_table(local(file))
         table.validate(full=True)  # text is UTF-8
     except (pyarrow.ArrowException, OSError) as error:
         raise DataError(f"{file} is not a whole Parquet file ({' '.join(str(error).split())})") from None

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from osel_sim.core.arrays import check_rows
+from osel_sim.core.arrays import check_rows, local
 from osel_sim.core.errors import DataError, did_you_mean
 from osel_sim.ingestion.columns import Columns, Join, flag
 
@@ -207,12 +207,12 @@ def _parquet(file: Path) -> Iterator[Record]:
     import pyarrow.parquet
 
     try:
-        names = pyarrow.parquet.read_schema(file).names
+        names = pyarrow.parquet.read_schema(local(file)).names
         check_rows(file)
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise DataError(f"{file}: column {twice!r} is there twice")
-        rows = pyarrow.parquet.read_table(file).to_pylist()
+        rows = pyarrow.parquet.read_table(local(file)).to_pylist()
     except (pyarrow.ArrowException, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{file}: is not a whole Parquet file ({reason})") from None

@@ -145,7 +145,7 @@ def frames(file: Path, count: int = _FRAMES) -> list[bytes]:
     import imageio.v3
 
     try:
-        pictures = imageio.v3.imread(file, plugin="FFMPEG")
+        pictures = imageio.v3.imread(file.absolute(), plugin="FFMPEG")
     except (OSError, ValueError, RuntimeError):
         return []
     return [jpeg(pictures[place]) for place in np.linspace(0, len(pictures) - 1, count).round().astype(int)]

@@ -19,8 +19,8 @@ SHARD = 20
 
 
 def shards_folder(out: Path) -> Path:
-    """Where the shards of a dataset lie until they are joined."""
-    return out.with_name(out.name + ".shards")
+    """Where the shards of a dataset lie until they are joined; absolute, since to Parquet's writers `12:30` at the beginning would be an address."""
+    return out.absolute().with_name(out.name + ".shards")
 
 
 def seeds(out: Path) -> int | None:
@@ -101,7 +101,7 @@ def _join(task: TaskSpec, out: Path, folders: list[Path], side: dict[str, Any]) 
     """Make one dataset out of shards, with a side file, put in place only when it is whole."""
     from lerobot.datasets.aggregate import aggregate_datasets
 
-    with atomic_folder(out) as partial:
+    with atomic_folder(out.absolute()) as partial:
         name = f"osel_sim/{task.name}"
         aggregate_datasets([name] * len(folders), name, roots=folders, aggr_root=partial, concatenate_data=False)
         (partial / "meta" / SIDE_FILE).write_text(json.dumps(side, indent=1))

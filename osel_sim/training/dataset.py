@@ -16,7 +16,7 @@ import numpy as np
 import pyarrow.parquet as parquet
 from numpy.typing import NDArray
 
-from osel_sim.core.arrays import check_rows
+from osel_sim.core.arrays import check_rows, local
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic, content_digest, is_partial, read_json
 from osel_sim.core.progress import progress as progress_bar
@@ -86,7 +86,7 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
     if (np.diff(episode) < 0).any():
         raise DataError(f"{folder}: episodes are not in order")
     starts = np.concatenate([[0], np.flatnonzero(np.diff(episode)) + 1, [len(episode)]]).astype(np.int64)
-    tasks = sorted(parquet.read_table(folder / "meta" / "tasks.parquet").to_pylist(), key=lambda row: row["task_index"])
+    tasks = sorted(parquet.read_table(local(folder / "meta" / "tasks.parquet")).to_pylist(), key=lambda row: row["task_index"])
     fingerprint = _fingerprint(folder, files)
     shapes = {camera: tuple(features[IMAGES + camera]["shape"]) for camera in cameras}
     return Demonstrations(
@@ -130,7 +130,7 @@ def dataset_folders(given: Sequence[Path]) -> list[Path]:
 
 
 def _columns(files: list[Path], names: list[str]) -> dict[str, NDArray[Any]]:
-    tables = [parquet.read_table(file, columns=names) for file in files]
+    tables = [parquet.read_table(local(file), columns=names) for file in files]
     arrays: dict[str, NDArray[Any]] = {}
     for name in names:
         parts = []
@@ -176,7 +176,7 @@ def _decode(files: list[Path], column: str, out: NDArray[np.uint8], label: str, 
     position = 0
     with ThreadPoolExecutor() as pool, progress_bar(len(out), "frame", label, quiet=not progress) as bar:
         for file in files:
-            for batch in parquet.ParquetFile(file).iter_batches(batch_size=DECODE_ROWS, columns=[column]):
+            for batch in parquet.ParquetFile(local(file)).iter_batches(batch_size=DECODE_ROWS, columns=[column]):
                 encoded = batch.column(0).field("bytes").to_pylist()
                 list(pool.map(decode, range(position, position + len(encoded)), encoded))
                 position += len(encoded)
