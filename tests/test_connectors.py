@@ -324,7 +324,7 @@ def test_an_openpi_server_gets_its_own_names_and_its_actions_are_read(openpi: st
         (NAMES.replace("observation/image", "observation/picture"), ["KeyError: 'observation/image'", "observation/picture (uint8 (32, 32, 3))"]),
         (NAMES + 'state_parts = ["position", "quaternion", "fingers"]\n', ["state must have shape (8,), got (9,)"]),
         (NAMES, ["actions have the shape (10, 32), the robot takes (T, 7)", "columns"]),
-        (NAMES + 'actions = "action"\n', ["answered without action (it has: actions, policy_timing, state)"]),
+        (NAMES + 'actions = "action"\n', ["answered without action (it has: actions (float64 (10, 32)), state (float32 (8,)), policy_timing"]),
     ],
 )
 def test_what_an_openpi_server_does_not_take_is_explained_at_load(openpi: str, mapping: str, words: list[str], tmp_path: Path) -> None:

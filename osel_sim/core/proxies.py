@@ -43,12 +43,15 @@ def proxy_for(url: str) -> Proxy | None:
 
     None for this machine, and for what NO_PROXY excepts: names, addresses, networks.
     """
-    parts = urlsplit(url)
+    try:
+        parts = urlsplit(url)
+    except ValueError:  # no address: whoever connects says so
+        return None
     host = parts.hostname or ""
     if is_loopback(host) or _excepted(host, f"{parts.netloc.rpartition('@')[2]}"):
         return None
     found = urllib.request.getproxies()
-    for scheme in _ORDER[parts.scheme]:
+    for scheme in _ORDER.get(parts.scheme, ()):
         address = found.get(scheme)
         if address:
             return Proxy(address if "://" in address else f"http://{address}", _variable(f"{scheme}_proxy"))

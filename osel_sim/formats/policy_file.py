@@ -4,6 +4,7 @@ import re
 from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated
+from urllib.parse import urlsplit
 
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic.dataclasses import dataclass
@@ -63,7 +64,17 @@ class Remote:
             raise ValueError(f"must start with ws:// or wss://{told}")
         if url is not None and not re.fullmatch(r"wss?://[^\s\"'<>]+", url):
             raise ValueError("must hold no spaces, quotes, < or > (within a password: %20, %22, %27, %3C, %3E)")
+        if url is not None and not _has_a_host(url):
+            raise ValueError("must name a host, and a port from 1 to 65535 (ws://host:port; an IPv6 address in brackets)")
         return url
+
+
+def _has_a_host(url: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        return False
 
 
 @dataclass(frozen=True, config=TABLE)

@@ -68,8 +68,11 @@ def message_of(observation: Observation, mapping: Conventions, cameras: tuple[st
     return message
 
 
-def actions_of(value: Any, mapping: Conventions, action: ActionSpec) -> NDArray[Any]:
-    """A policy's chunk (T, N), or single action (N,), as actions of the environment (T, D).
+def actions_of(value: Any, mapping: Conventions, action: ActionSpec, name: str = "actions") -> NDArray[Any]:
+    """A policy's chunk (T, N), single action (N,), or batch of one (1, T, N), as actions of the environment (T, D).
+
+    Args:
+        name: what the policy calls them.
 
     Raises:
         PolicyError: it is no such array.
@@ -77,16 +80,20 @@ def actions_of(value: Any, mapping: Conventions, action: ActionSpec) -> NDArray[
     try:
         actions = np.asarray(value)
     except ValueError as error:  # ragged lists
-        raise PolicyError(f"actions are not an array ({error})") from None
+        raise PolicyError(f"{name} are not an array ({error})") from None
     if actions.dtype.kind not in "fiu":
-        raise PolicyError(f"actions must be real numbers, got dtype {actions.dtype}")
+        raise PolicyError(f"{name} must be real numbers, got dtype {actions.dtype}")
     actions = np.atleast_2d(actions)
-    if actions.ndim != 2 or (not mapping.columns and actions.shape[1] != action.dimension):
+    while actions.ndim > 2 and len(actions) == 1:
+        actions = actions[0]
+    if actions.ndim != 2:
+        raise PolicyError(f"{name} have the shape {actions.shape}, one chunk (T, {action.dimension}) is needed")
+    if not mapping.columns and actions.shape[1] != action.dimension:
         size = action.dimension
-        raise PolicyError(f"actions have the shape {actions.shape}, the robot takes (T, {size}); say in [mapping] columns which those are")
+        raise PolicyError(f"{name} have the shape {actions.shape}, the robot takes (T, {size}); say in [mapping] columns which those are")
     columns = list(mapping.columns or range(action.dimension))
     if actions.shape[1] <= max(columns):
-        raise PolicyError(f"actions have the shape {actions.shape}, [mapping] columns = {columns} needs more numbers in each")
+        raise PolicyError(f"{name} have the shape {actions.shape}, [mapping] columns = {columns} needs more numbers in each")
     result = actions[:, columns].astype(np.float64)
     if has_scale(mapping):
         result[:, action.motions] *= mapping.scale

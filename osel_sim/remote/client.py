@@ -22,6 +22,7 @@ from osel_sim.interface.policy import Actions, Observation
 from osel_sim.policy.local import check_actions
 from osel_sim.policy.mapping import actions_of, message_of
 from osel_sim.remote.codec import ProtocolError, pack, unpack
+from osel_sim.remote.dialects import actions_in, size_of, unpack_any
 from osel_sim.remote.protocol import IMAGES, RESET, Greeting, check_header
 
 MAX_ANSWER = 16 << 20  # bytes; a chunk of 1,000 actions has 56,000
@@ -115,7 +116,7 @@ class RemoteClient:
             return
         end = time.monotonic() + self._timeout
         self._connection = self._open()
-        metadata = self._decode(self._receive(end), "greeting")
+        metadata = self._decode(self._receive(end), "greeting", foreign=True)  # whose it is, only the greeting says
         try:
             self._greeting = Greeting.parse(metadata)
         except ProtocolError as error:
@@ -152,17 +153,19 @@ class RemoteClient:
             raise RemoteError(f"{self.url}: not connected")
         reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation), environment) if self.foreign else observation)
         measured = time.perf_counter() - start
-        key = self._mapping.actions if self.foreign else "actions"
-        if not isinstance(reply, dict) or key not in reply:
-            got = ", ".join(sorted(str(name)[:40] for name in list(reply)[:10])) if isinstance(reply, dict) else type(reply).__name__
-            raise self._fail(f"answered without {key} (it has: {got or 'nothing'})")
         try:
-            own = actions_of(reply[key], self._mapping, environment.action) if self.foreign else reply[key]
+            if self.foreign:
+                key = self._mapping.actions
+                own = actions_of(actions_in(reply, key), self._mapping, environment.action, key)
+            elif isinstance(reply, dict) and "actions" in reply:
+                own = reply["actions"]
+            else:
+                raise PolicyError("answered without actions")
             actions = check_actions(own, environment.action)
         except PolicyError as error:
             raise self._fail(str(error)) from None
-        payload = {key: value for key, value in reply.items() if not (isinstance(key, str) and key.endswith("timing"))}
-        return Answer(actions, measured, bytes_up, len(pack(payload)))
+        payload = {key: value for key, value in reply.items() if not key.endswith("timing")} if isinstance(reply, dict) else reply
+        return Answer(actions, measured, bytes_up, size_of(payload) if self.foreign else len(pack(payload)))
 
     def close(self) -> None:
         """Hang up. May be called twice; takes at most a second or so."""
@@ -231,7 +234,7 @@ class RemoteClient:
             if full:
                 raise self._fail(f"took no message within {self._timeout:g} s", NoAnswerError) from None
             raise self._fail(f"closed the connection ({error})", HungUpError) from None
-        return self._decode(self._receive(end), "answer"), len(frame)
+        return self._decode(self._receive(end), "answer", self.foreign), len(frame)
 
     def _receive(self, end: float) -> str | bytes:
         if self._connection is None:
@@ -243,13 +246,13 @@ class RemoteClient:
         except (ConnectionClosed, OSError) as error:
             raise self._fail(f"closed the connection ({error})", HungUpError) from None
 
-    def _decode(self, frame: str | bytes, what: str) -> Any:
+    def _decode(self, frame: str | bytes, what: str, foreign: bool) -> Any:
         if isinstance(frame, str):
             # openpi sends a whole traceback; its last line is the error.
             lines = frame.strip().splitlines() or [""]
             raise self._fail(f"reported an error: {lines[-1][:300]}")
         try:
-            return unpack(frame)
+            return unpack_any(frame) if foreign else unpack(frame)
         except ProtocolError as error:
             raise self._fail(f"its {what} is unreadable: {error}") from None
 
