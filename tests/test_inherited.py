@@ -37,6 +37,7 @@ def environment(monkeypatch):
 def test_which_proxy_a_server_is_behind(environment, name, value, proxy):
     environment(name, value)
     assert str(proxies.proxy_for(LAN)) == proxy
+    assert proxies.proxy_for("ws://[::1:9") is None  # no address: who connects says so
     assert proxies.proxy_for("ws://127.0.0.1:8000") is None and proxies.proxy_for("ws://[::1]:8000") is None
     for excepted in ("192.0.2.7", "localhost, 192.0.2.0/24", "*", "[::1],192.0.2.7:9001"):
         environment("NO_PROXY", excepted)

@@ -4,7 +4,6 @@ import re
 from dataclasses import field, fields
 from pathlib import Path
 from typing import Annotated
-from urllib.parse import urlsplit
 
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic.dataclasses import dataclass
@@ -49,12 +48,12 @@ class Remote:
     """`blocking` (hold still until the answer is there) or `async` (finish the chunk at hand meanwhile)."""
     deadline: Annotated[float, between(0.001, 3600.0)] = 2.0
     """Seconds on the virtual clock after which a call is given up."""
-    timeout: Annotated[float, between(0.1, 3600.0)] = 30.0
-    """Real seconds that a server may take for an answer, or for a new connection."""
     fallback: str | None = None
     """Local policy that takes over then; without one it is an error outcome."""
     url: str | None = None
     """Connect to this server (`ws://...`) instead of starting one."""
+    timeout: Annotated[float, between(0.1, 3600.0)] = 30.0
+    """Real seconds that a server may take for an answer, or for a new connection."""
 
     @field_validator("url")
     @classmethod
@@ -64,17 +63,7 @@ class Remote:
             raise ValueError(f"must start with ws:// or wss://{told}")
         if url is not None and not re.fullmatch(r"wss?://[^\s\"'<>]+", url):
             raise ValueError("must hold no spaces, quotes, < or > (within a password: %20, %22, %27, %3C, %3E)")
-        if url is not None and not _has_a_host(url):
-            raise ValueError("must name a host, and a port from 1 to 65535 (ws://host:port; an IPv6 address in brackets)")
         return url
-
-
-def _has_a_host(url: str) -> bool:
-    try:
-        parts = urlsplit(url)
-        return bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        return False
 
 
 @dataclass(frozen=True, config=TABLE)

@@ -74,7 +74,9 @@ def find_backend() -> Backend:
     if len(checked) == 2 and checked[0] == wanted:
         return Backend(*checked)
     platform_wanted = os.environ.get(PLATFORM, "").strip().lower()
-    if wanted and platform_wanted in HEADLESS and platform_wanted != wanted:
+    if checked and checked[0] == platform_wanted:
+        platform_wanted = ""  # ours, of an earlier finding
+    if wanted in BACKENDS and platform_wanted in HEADLESS and platform_wanted != wanted:
         raise DisplayError(f"MUJOCO_GL={wanted} and {PLATFORM}={platform_wanted} contradict each other: unset one of them")
     if wanted:
         return _use(wanted, "MUJOCO_GL")
