@@ -88,7 +88,7 @@ def replay(
     streams = tuple(draw_streams(table, seeds, decisions) for table in tables)
     material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams, factories or {})
     jobs = [(at, name, number) for name in sorted(selectors, key=_slowness) for at in range(len(setups)) for number in range(len(seeds))]
-    chosen = [{name: np.zeros(own.order.shape, np.int8) for name in selectors} for own in streams]
+    chosen = [{name: np.zeros(own.order.shape, np.int16) for name in selectors} for own in streams]
     for (at, name, number), columns in _run(material, jobs, workers):
         chosen[at][name][number] = columns
         if progress is not None:
@@ -105,7 +105,7 @@ def replay_one(
     warm_start: WarmStart | None = None,
     factory: SelectorFactory | None = None,
     **settings: Any,
-) -> NDArray[np.int8]:
+) -> NDArray[np.int16]:
     """Show one stream to one selector, which sees the reward of its choices only.
 
     Args:
@@ -128,7 +128,7 @@ def replay_one(
     if isinstance(selector, PPOSelector) and supports(selector):
         return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
     column = {policy: index for index, policy in enumerate(policies)}
-    chosen = np.zeros(len(contexts), np.int8)
+    chosen = np.zeros(len(contexts), np.int16)
     for decision, context in enumerate(contexts):
         choice = selector.select(context)
         chosen[decision] = column[choice.policy]
@@ -140,7 +140,7 @@ def _slowness(name: str) -> int:
     return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
 
 
-def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
+def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, NDArray[np.int16]]]:
     if workers == 1:
         with _one_thread():
             for job in jobs:
@@ -153,13 +153,13 @@ def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tu
             yield event.value
 
 
-def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int8]]]:
+def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
     """What a worker does."""
     _limit_threads()
     return lambda job, _: [_replay_job(material, job)]
 
 
-def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int8]]:
+def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int16]]:
     at, name, number = job
     setup, streams = material.setups[at], material.streams[at]
     rewards = streams.rewards(material.rewards[at], number)

@@ -23,8 +23,8 @@ REFERENCES = (BEST, WORST)
 def with_fixed(choices: Choices, best: Oracles) -> Choices:
     """The choices with those of every fixed policy added, and of the best and the worst under names of their own."""
     shape = choices.order.shape
-    fixed = {f"fixed:{policy}": np.full(shape, column, np.int8) for column, policy in enumerate(choices.policies)}
-    singles = {name: np.full(shape, column, np.int8) for name, column in ((BEST, best.best_single), (WORST, best.worst_single))}
+    fixed = {f"fixed:{policy}": np.full(shape, column, np.int16) for column, policy in enumerate(choices.policies)}
+    singles = {name: np.full(shape, column, np.int16) for name, column in ((BEST, best.best_single), (WORST, best.worst_single))}
     return Choices(choices.instances, choices.policies, choices.order, choices.repeats, {**choices.chosen, **singles, **fixed})
 
 

@@ -51,7 +51,7 @@ class FastPPO:
         self.critic = _tower(state, "value_net", "value_net")
         self.steps = np.zeros(1, np.int64)
 
-    def run(self, contexts: NDArray[np.float32], rewards: NDArray[np.float64]) -> NDArray[np.int8]:
+    def run(self, contexts: NDArray[np.float32], rewards: NDArray[np.float64]) -> NDArray[np.int16]:
         """Go through a stream.
 
         Args:
@@ -64,7 +64,7 @@ class FastPPO:
         from osel_sim.selection.ppo.kernel import BLOCK, forward, log_softmax, train
 
         total, policies, size = len(contexts), rewards.shape[1], self._n_steps
-        chosen = np.zeros(total, np.int8)
+        chosen = np.zeros(total, np.int16)
         widest = int(max(self.actor[3][1:]))
 
         def buffers(tower: "Tower") -> list[NDArray[np.float32]]:
