@@ -72,7 +72,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
 def _measures(reward: Mapping[str, Any]) -> dict[str, tuple[str, int | None]]:
     """Which means a table of selectors shows besides reward and success, with their headings and digits: what the reward is made of."""
     graded = {"subgoals": {"mean_subgoals": ("subgoals", 2)}, "score": {"mean_score": ("score", 4)}}.get(reward["success"], {})
-    time = {"mean_steps": ("steps", 0)} if reward["time_unit"] == "steps" else {"mean_seconds": ("seconds", 2)}
+    time = {"mean_steps": ("steps", 0)} if reward["time_unit"].endswith("steps") else {"mean_seconds": ("seconds", 2)}
     return {**graded, **time, "mean_price": ("price (cents)", None)}
 
 
