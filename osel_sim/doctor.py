@@ -70,15 +70,12 @@ def _examine_policy(config: DoctorConfig, policy: str) -> int:
 
 
 def _print(checks: list[Check], ready: bool) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    from osel_sim.cli.console import console
+    from osel_sim.cli.console import Table, console, plain
 
     colours = {OK: "green", NOTE: "yellow", MISSING: "red"}
-    table = Table("", "area", "what", "found", "to put it right")
+    table = Table("", ["", "area", "what", "found", "to put it right"])
     for check in checks:
-        table.add_row(f"[{colours[check.state]}]{check.state}[/]", check.area, *(escape(text) for text in (check.name, check.found, check.fix)))
+        table.add(plain(check.state, colours[check.state]), check.area, check.name, check.found, check.fix)
     console().print(table)
     missing = sum(check.state == MISSING for check in checks)
     console().print("ready to run" if ready else f"{missing} {'thing is' if missing == 1 else 'things are'} missing")

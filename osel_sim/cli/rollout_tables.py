@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 from rich.console import Console
-from rich.table import Table
 
-from osel_sim.cli.console import number, percent
+from osel_sim.cli.console import Table, number, percent
 from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import Row
 from osel_sim.interface.robot import DEFAULT_ROBOT
@@ -63,21 +62,19 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
     instances = len({row.instance for row in rows})
     tasks = {row.task: None for row in rows}
     title = f"{len(tasks)} tasks" if len(tasks) > 1 else next(iter(tasks), "")
-    table = Table(title=f"{title}: {instances} instances, {len(rows)} episodes", title_justify="left")
-    table.add_column("policy")
     optional = {name: (heading, digits) for name, (heading, digits) in _MEASURES.items() if any(getattr(row, name) is not None for row in rows)}
     seconds, rewards = row_seconds(rows), row_rewards(rows, weights)
     timed = bool(np.isfinite(seconds).any())
     headings = ["episodes", "success [95%]", *(heading for heading, _ in optional.values()), *(["seconds"] if timed else [])]
-    for heading in (*headings, "mean reward", "best on", "fallbacks", "errors"):
-        table.add_column(heading, justify="right")
+    headings += ["mean reward", "best on", "fallbacks", "errors"]
+    table = Table(f"{title}: {instances} instances, {len(rows)} episodes", ["policy"], headings)
     best = share_best(rows, policies, weights)
     for policy in policies:
         own = [row for row in rows if row.policy == policy]
         valid = [row for row in own if row.error is None]
         counted = np.array([row.policy == policy and row.error is None for row in rows])
         measured = [number(_mean([getattr(row, name) for row in valid]), digits) for name, (_, digits) in optional.items()]
-        table.add_row(
+        table.add(
             policy,
             str(len(own)),
             _rate(valid),
@@ -96,12 +93,7 @@ _MEASURES = {"subgoals": ("subgoals", 2), "score": ("score", 4), "steps": ("step
 
 
 def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
-    table = Table(title="success [95%] by kind of instance", title_justify="left")
-    table.add_column("by")
-    table.add_column("")
-    table.add_column("instances", justify="right")
-    for policy in policies:
-        table.add_column(policy, justify="right")
+    table = Table("success [95%] by kind of instance", ["by", ""], ["instances", *policies])
     kinds: dict[str, int] = {}
     for name, key in SPLITS.items():
         parts: dict[str, list[Row]] = defaultdict(list)
@@ -116,7 +108,7 @@ def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
             continue  # shown already
         for value, part in sorted(parts.items()):
             rates = [_rate([row for row in part if row.policy == policy and row.error is None]) for policy in policies]
-            table.add_row(name, value, str(len({row.instance for row in part})), *rates)
+            table.add(name, value, str(len({row.instance for row in part})), *rates)
         table.add_section()
     return table
 
