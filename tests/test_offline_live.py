@@ -57,7 +57,8 @@ def make_run(folder: Path, decisions: int = 400, counterfactual: bool = False) -
         reward = None if one.error else float(one.success)
         own = {key: value for key, value in vars(one).items()}
         journal.append(asdict(Decision(**about, propensities={"local": 0.8, "remote": 0.2}, reward=reward, **own)))
-        others.append({"index": index, "policies": {name: {**found[name].to_dict(), "reward": 0.0} for name in found if name != policy}})
+        rewards = {name: None if other.error else float(other.success) for name, other in found.items()}
+        others.append({"index": index, "policies": {name: {**found[name].to_dict(), "reward": rewards[name]} for name in found if name != policy}})
     cache.save()
     (folder / "episodes.jsonl").write_text("".join(to_line(row) for row in journal))
     if counterfactual:

@@ -6,13 +6,15 @@ Everything here works on arrays, NaN standing for what is not known; a single ou
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, OselError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import Row
+from osel_sim.formats.toml_types import quoted
+from osel_sim.formats.values import AMOUNT, TEXT, fault
 from osel_sim.interface.outcome import Outcome
 
 Array = NDArray[np.float64]
@@ -144,6 +146,43 @@ def reward(outcome: Outcome, weights: RewardWeights) -> float:
         raise UsageError("an episode has no score; S must be 'success' or 'subgoals'")
     time = counted_time(weights, outcome.steps, total_seconds(**vars(outcome.seconds)))
     return float(combined(weights, getattr(outcome, weights.success), time, outcome.price))
+
+
+def check_reward(value: float | None, outcome: Outcome, weights: RewardWeights, place: str) -> None:
+    """Refuse a reward that was written down, and is not what its outcome comes to.
+
+    Args:
+        place: of both, such as file and line.
+
+    Raises:
+        DataError: naming the place, and the reward that would be right.
+    """
+    right = None if outcome.error is not None else reward(outcome, weights)
+    # Another machine's logarithm may differ in the last bit.
+    if (value is None) != (right is None) or (value is not None and right is not None and not math.isclose(value, right, rel_tol=1e-9, abs_tol=1e-9)):
+        raise DataError(f"{place}: reward is {quoted(value)}, its outcome comes to {quoted(right)}")
+
+
+def weights_from(data: Any, place: str) -> RewardWeights:
+    """Weights that were written down as JSON.
+
+    Args:
+        place: where, for the error.
+
+    Raises:
+        DataError: they do not have the promised form.
+    """
+    if not isinstance(data, dict):
+        raise DataError(f"{place} must be an object of {', '.join(_JSON)}, got {quoted(data)}")
+    if problem := fault(data, _JSON):
+        raise DataError(f"{place}: {problem}")
+    try:
+        return RewardWeights(**data)
+    except OselError as error:
+        raise DataError(f"{place}: {error}") from None
+
+
+_JSON = {"alpha_time": AMOUNT, "alpha_price": AMOUNT, "time_unit": TEXT, "success": TEXT}
 
 
 def row_seconds(rows: Sequence[Row]) -> Array:
