@@ -63,16 +63,8 @@ def test_names_of_a_replay_are_no_markup(capsys: pytest.CaptureFixture[str], mak
     print_replay(make(), result)
     text = said(capsys)
     assert all(f" {name} " in text for name in NAMES) and "always use [/bold]." in text and "[v2], model [v3], [/bold] and 4 more" in text
-    target = {
-        "ips": 0.5,
-        "ips_ci95": None,
-        "snips": 0.5,
-        "snips_ci95": None,
-        "dr": 0.5,
-        "dr_ci95": None,
-        "effective_decisions": 9.0,
-        "unsupported": 0,
-    }
+    target = {"few": [], "measured": 0.5, "unsupported": 0} | {f"{way}_effective": 9.0 for way in ("ips", "snips", "dr")}
+    target |= {f"{way}{end}": None for way in ("ips", "snips", "dr") for end in ("", "_ci95")}
     run = {"selector": "[/x]", "decisions": 3, "errors": 1, "mean_reward": 0.5, "ci95": [0.4, 0.6]}
     print_off_policy(make(), {"run": run, "targets": {f"fixed:{name}": target for name in NAMES}})
     text = said(capsys)

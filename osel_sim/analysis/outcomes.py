@@ -94,9 +94,9 @@ def remote_policies(log: LoggedOutcomes) -> tuple[NDArray[np.bool_], str]:
         remote = (values > 0.0).any(axis=(0, 2))
         if remote.any() and not remote.all():
             return remote, reason
-    rates = np.nanmean(mean_over_repeats(log.success), axis=0)
+    rates = mean_over_repeats(mean_over_repeats(log.success).T)
     remote = np.ones(len(log.policies), bool)
-    remote[int(np.nanargmin(rates))] = False
+    remote[int(np.nan_to_num(rates, nan=np.inf).argmin())] = False  # a policy that was never chosen has no rate
     return remote, "local: the policy with the lowest success, as in the paper, because the log has no network times or prices that tell"
 
 

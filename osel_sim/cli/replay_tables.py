@@ -55,15 +55,22 @@ def print_off_policy(console: Console, found: Mapping[str, Any]) -> None:
     """Print what other ways of choosing would have earned in a live run."""
     run = found["run"]
     title = f"{run['selector']}, {run['decisions']} decisions: what others would have earned"
-    table = Table(title, [""], ("IPS [95%]", "SNIPS [95%]", "DR [95%]", "effective decisions"))
-    table.add(f"{run['selector']} (as it was)", "", "", _with_interval(run["mean_reward"], run["ci95"]), str(run["decisions"]))
+    table = Table(title, [""], ("measured", "IPS [95%] (n)", "SNIPS [95%] (n)", "DR [95%] (n)"))
+    table.add(f"{run['selector']} (as it was)", _with_interval(run["mean_reward"], run["ci95"]), "", "", "")
     table.add_section()
     for name, entry in found["targets"].items():
-        cells = [_with_interval(entry[key], entry[f"{key}_ci95"]) if entry[key] is not None else "-" for key in ("ips", "snips", "dr")]
-        table.add(name, *cells, f"{entry['effective_decisions']:.0f}" + (" (unsupported)" if entry["unsupported"] else ""))
+        cells = [_estimate(entry, way) for way in ("ips", "snips", "dr")]
+        table.add(name + (" (unsupported)" if entry["unsupported"] else ""), number(entry["measured"], 3), *cells)
     console.print(table)
+    console.print("n: effective decisions, that is how many made that way would weigh as much; an estimate that rests on too few is not shown")
     if run["errors"]:
         console.print(f"{run['errors']} decisions that ended in error were left out.")
+
+
+def _estimate(entry: Mapping[str, Any], way: str) -> str:
+    """An estimate with the number of decisions that it rests on."""
+    shown = "-" if entry[way] is None or way in entry["few"] else _with_interval(entry[way], entry[f"{way}_ci95"])
+    return f"{shown} ({entry[f'{way}_effective']:.0f})"
 
 
 def _few(tasks: Sequence[str]) -> str:

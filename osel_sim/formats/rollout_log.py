@@ -195,7 +195,7 @@ def _metadata(file: Path, raw: dict[bytes, bytes]) -> dict[str, Any]:
     if not isinstance(version, int) or isinstance(version, bool) or not 1 <= version <= SCHEMA_VERSION:
         raise DataError(f"{file}: osel_sim.schema_version must be 1 to {SCHEMA_VERSION}, got {version}")
     written = metadata.pop(_CHECKSUM, None)  # logs of earlier versions have none
-    if written is not None and written != _checksum({key: value for key, value in metadata.items() if key != "schema_version"}):
+    if written is not None and written != _checksum(metadata):
         raise DataError(f"{file}: its metadata is damaged: it does not fit its checksum")
     policies, encoder = metadata.get("policies", []), metadata.get("encoder")
     if not isinstance(policies, list) or not all(map(NAME.fits, policies)):
@@ -235,7 +235,7 @@ def _in_one_line(error: Exception) -> str:
 
 def _checksum(metadata: Mapping[str, Any]) -> str:
     """Of the metadata: the checksums of a Parquet file's pages are of its columns only."""
-    return content_digest(json.dumps(metadata, sort_keys=True))
+    return content_digest(json.dumps({key: value for key, value in metadata.items() if key not in ("schema_version", _CHECKSUM)}, sort_keys=True))
 
 
 def _check_types(file: Path, found: "pyarrow.Schema") -> None:
