@@ -230,6 +230,8 @@ def test_a_journal_that_lost_decisions_is_refused(copy: Path, keep: int) -> None
         ({"schema_version": None}, "schema_version must be 1, got None"),
         ({"configuration": []}, "configuration must be an object"),
         ({"environment": "x"}, "environment must be an object"),
+        ({"environment": {"versions": 5}}, r"environment\.versions must be an object of texts"),
+        ({"configuration": {"content": [{}]}}, r"configuration\.content must be an object of texts"),
     ],
 )
 def test_a_run_of_another_form_is_refused(copy: Path, changes: dict, says: str) -> None:

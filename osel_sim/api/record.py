@@ -180,6 +180,8 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
     except KeyError as missing:
         raise DataError(f"{folder / RUN}: not of a recording by this version, it has no {missing}; give all flags it was made with") from None
+    except (TypeError, AttributeError) as error:
+        raise DataError(f"{folder / RUN}: configuration does not have the promised form ({error})") from None
     return config.changed(**values)
 
 

@@ -73,14 +73,15 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
         own = [row for row in rows if row.policy == policy]
         valid = [row for row in own if row.error is None]
         counted = np.array([row.policy == policy and row.error is None for row in rows])
-        measured = [number(_mean([getattr(row, name) for row in valid]), digits) for name, (_, digits) in optional.items()]
+        on = [row.instance for row in valid]
+        measured = [number(_mean([getattr(row, name) for row in valid], on), digits) for name, (_, digits) in optional.items()]
         table.add(
             policy,
             str(len(own)),
             _rate(valid),
             *measured,
-            *([number(_mean(seconds[counted]))] if timed else []),
-            number(_mean(rewards[counted]), 3),
+            *([number(_mean(seconds[counted], on))] if timed else []),
+            number(_mean(rewards[counted], on), 3),
             percent(best.get(policy)),
             str(sum(row.fallback is not None for row in own)),
             str(len(own) - len(valid)),
@@ -119,13 +120,16 @@ def _rate(valid: Sequence[Row]) -> str:
     by_instance: dict[str, list[bool]] = defaultdict(list)
     for row in valid:
         by_instance[row.instance].append(row.success)
-    rate = sum(row.success for row in valid) / len(valid)
-    trials = effective_trials([float(np.mean(successes)) for successes in by_instance.values()], len(valid))
+    rates = [float(np.mean(successes)) for successes in by_instance.values()]
+    rate, trials = float(np.mean(rates)), effective_trials(rates, len(valid))
     return percent(rate, wilson_interval(min(rate * trials, trials), trials))
 
 
-def _mean(values: ArrayLike) -> float | None:
-    """Mean of what is known: neither None nor NaN."""
+def _mean(values: ArrayLike, instances: Sequence[str]) -> float | None:
+    """Mean over instances (n,) of the means of what is known of each, neither None nor NaN: as the page has it, whatever the repeats."""
     numbers = np.asarray(values, np.float64)
-    known = numbers[np.isfinite(numbers)]
-    return float(known.mean()) if known.size else None
+    known = np.isfinite(numbers)
+    if not known.any():
+        return None
+    _, at = np.unique(np.asarray(instances)[known], return_inverse=True)
+    return float((np.bincount(at, numbers[known]) / np.bincount(at)).mean())

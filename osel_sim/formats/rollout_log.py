@@ -19,7 +19,7 @@ from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic, content_digest
 from osel_sim.formats.toml_types import plain_name, quoted
-from osel_sim.formats.values import NAME, ROW
+from osel_sim.formats.values import NAME, ROW, TEXTS
 from osel_sim.interface.instance import instance_key, label
 from osel_sim.interface.outcome import Outcome, Seconds
 
@@ -200,6 +200,8 @@ def _metadata(file: Path, raw: dict[bytes, bytes]) -> dict[str, Any]:
     policies, encoder = metadata.get("policies", []), metadata.get("encoder")
     if not isinstance(policies, list) or not all(map(NAME.fits, policies)):
         raise DataError(f"{file}: policies in its metadata must be a list of names, got {quoted(policies)}")
+    if not TEXTS.fits(metadata.get("content") or {}):
+        raise DataError(f"{file}: content in its metadata must be {TEXTS.wanted}, got {quoted(metadata['content'])}")
     if not NAME.or_null.fits(encoder):
         raise DataError(f"{file}: encoder in its metadata must be {NAME.or_null.wanted}, got {quoted(encoder)}")
     return metadata

@@ -18,6 +18,7 @@ from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import digest, is_partial, read_json, write_json
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.toml_types import quoted
+from osel_sim.formats.values import TEXTS
 from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.interface.suite import Task
 
@@ -42,6 +43,9 @@ def read_run(folder: Path) -> dict[str, Any]:
     for key in ("configuration", "environment"):
         if not isinstance(data.setdefault(key, {}), dict):
             raise DataError(f"{file}: {key} must be an object, got {quoted(data[key])}")
+    for key, name in (("configuration", "content"), ("environment", "versions")):
+        if not TEXTS.fits(data[key].get(name) or {}):
+            raise DataError(f"{file}: {key}.{name} must be {TEXTS.wanted}, got {quoted(data[key][name])}")
     return data
 
 

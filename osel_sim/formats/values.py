@@ -35,6 +35,7 @@ def _is_number(value: Any) -> bool:
 
 TEXT = Kind("text", lambda value: isinstance(value, str))
 NAME = Kind("text that is not empty", lambda value: isinstance(value, str) and value != "")
+TEXTS = Kind("an object of texts", lambda value: isinstance(value, dict) and all(item is None or isinstance(item, str) for item in value.values()))
 FLAG = Kind("true or false", lambda value: isinstance(value, bool))
 COUNT = Kind("an integer of 0 or more", lambda value: type(value) is int and 0 <= value < _LARGEST)
 NUMBER = Kind("a finite number", _is_number)

@@ -52,7 +52,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     look = _look(run, streams)
     blocks: list[Block] = [curve_figure(streams, look, run.log.policies)]
     if HINDSIGHT in streams:
-        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look)]
+        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look, np.arange(len(run.chosen))[None])]
     blocks += [_propensities(run), _chosen_table(run, selector)]
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
