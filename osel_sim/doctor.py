@@ -1,5 +1,6 @@
 """What works here, what is missing and which command fixes it: `python -m osel_sim.doctor`. With --policy: how a policy is connected."""
 
+import contextlib
 import json
 import sys
 from dataclasses import asdict
@@ -44,7 +45,8 @@ def _execute(config: DoctorConfig) -> int:
     if config.policy is not None:
         with trusting(config.trust):
             return _examine_policy(config, config.policy)
-    checks = examine(config.tasks, config.policies_dir)
+    with contextlib.redirect_stdout(sys.stderr):  # what plugins print while they load is no part of it
+        checks = examine(config.tasks, config.policies_dir)
     ready = all(check.state != MISSING for check in checks)
     if config.json:
         print(json.dumps({"ready": ready, "checks": [asdict(check) for check in checks]}, indent=2))

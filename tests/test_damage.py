@@ -10,12 +10,13 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet
 import pytest
-from report_helpers import made_run
+from report_helpers import WEIGHTS, made_run
 from synthetic_log import make_row
 
 from osel_sim.analysis.live import is_live_run, read_live
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError, OselError
+from osel_sim.episodes.live import LiveOptions, LiveRun
 from osel_sim.formats.rollout_log import ROLLOUTS, read_rollouts, write_rollouts
 from osel_sim.formats.run_config import check_run_folder
 from osel_sim.formats.shards import SHARDS, Shards
@@ -220,6 +221,21 @@ def test_a_journal_that_lost_decisions_is_refused(copy: Path, keep: int) -> None
     (copy / "counterfactual.jsonl").write_bytes(b"".join((copy / "counterfactual.jsonl").read_bytes().splitlines(keepends=True)[:keep]))
     with pytest.raises(DataError, match=f"counterfactual.jsonl: line {keep + 1} is missing"):
         read_live(copy)
+
+
+@pytest.mark.parametrize("keep", [0, 1, 3, 4])
+@pytest.mark.parametrize("beside", ["counterfactual.jsonl", "timing.jsonl", "summary.json"])
+def test_going_on_with_a_journal_that_lost_decisions_overwrites_nothing(copy: Path, keep: int, beside: str) -> None:
+    lines = (copy / "episodes.jsonl").read_bytes().splitlines(keepends=True)
+    (copy / "episodes.jsonl").write_bytes(b"".join(lines[:keep]))
+    if beside != "counterfactual.jsonl":
+        (copy / "counterfactual.jsonl").unlink()
+        (copy / beside).write_text('{"index": 0}\n' * 6 if beside == "timing.jsonl" else '{"decisions": 6}')
+    before = {file.name: file.read_bytes() for file in copy.iterdir()}
+    options = LiveOptions(0, WEIGHTS, counterfactual=beside == "counterfactual.jsonl")
+    with pytest.raises(DataError, match=f"{beside}.*the journal lost decisions; put it back"):
+        LiveRun(copy, (), None, None, None, options)
+    assert {file.name: file.read_bytes() for file in copy.iterdir()} == before
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """The tasks, robots, policies and suites there are, for `python -m osel_sim.run --list`: reads TOML and imports no simulator."""
 
+import contextlib
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -35,7 +37,8 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
 
 def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Path | None = None) -> None:
     """Print the listing as tables, or as JSON."""
-    found = listing(tasks, policies)
+    with contextlib.redirect_stdout(sys.stderr):  # what plugins print while they load is no part of it
+        found = listing(tasks, policies)
     if as_json:
         print(json.dumps(found, indent=2))
         return
