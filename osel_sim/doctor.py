@@ -1,5 +1,6 @@
 """What works here, what is missing and which command fixes it: `python -m osel_sim.doctor`. With --policy: how a policy is connected."""
 
+import contextlib
 import json
 import sys
 from dataclasses import asdict
@@ -44,7 +45,8 @@ def _execute(config: DoctorConfig) -> int:
     if config.policy is not None:
         with trusting(config.trust):
             return _examine_policy(config, config.policy)
-    checks = examine(config.tasks, config.policies_dir)
+    with contextlib.redirect_stdout(sys.stderr):  # what plugins print while they load is no part of it
+        checks = examine(config.tasks, config.policies_dir)
     ready = all(check.state != MISSING for check in checks)
     if config.json:
         print(json.dumps({"ready": ready, "checks": [asdict(check) for check in checks]}, indent=2))
@@ -70,15 +72,12 @@ def _examine_policy(config: DoctorConfig, policy: str) -> int:
 
 
 def _print(checks: list[Check], ready: bool) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    from osel_sim.cli.console import console
+    from osel_sim.cli.console import Table, console, plain
 
     colours = {OK: "green", NOTE: "yellow", MISSING: "red"}
-    table = Table("", "area", "what", "found", "to put it right")
+    table = Table("", ["", "area", "what", "found", "to put it right"])
     for check in checks:
-        table.add_row(f"[{colours[check.state]}]{check.state}[/]", check.area, *(escape(text) for text in (check.name, check.found, check.fix)))
+        table.add(plain(check.state, colours[check.state]), check.area, check.name, check.found, check.fix)
     console().print(table)
     missing = sum(check.state == MISSING for check in checks)
     console().print("ready to run" if ready else f"{missing} {'thing is' if missing == 1 else 'things are'} missing")

@@ -40,7 +40,7 @@ def _execute(config: IngestConfig) -> int:
         print(note)
     print(f"{result.folder}: {len(result.rows)} rows, contexts of {result.encoder}, {result.seconds:.0f} s")
     print_rollouts(console(), result.rows, weights)
-    print(f"reward ({preset}): {weights.success} - {weights.alpha_time} {weights.time_unit} - {weights.alpha_price} cents")
+    print(f"reward ({preset}): {weights.success} - {weights.alpha_time} {weights.time_text} - {weights.alpha_price} cents")
     print(f"written to {result.folder}; python -m osel_sim.replay {result.folder} --preset {preset} replays it to selectors")
     return 0
 

@@ -50,7 +50,7 @@ def _print_summary(folder: Path) -> None:
         raise DataError(f"{folder}: the rollout log has no rows")
     weights = preset(DEFAULT_PRESET)
     print_rollouts(console(), rows, weights)
-    print(f"reward: success - {weights.alpha_time} log10(seconds) - {weights.alpha_price} cents; episodes with errors count nowhere else")
+    print(f"reward: success - {weights.alpha_time} {weights.time_text} - {weights.alpha_price} cents; episodes with errors count nowhere else")
 
 
 def _summary(given: Mapping[str, Any]) -> int:

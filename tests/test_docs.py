@@ -212,5 +212,5 @@ def test_presets_are_those_of_the_page() -> None:
     page = (ROOT / "docs" / "concepts.md").read_text()
     for name, weights in PRESETS.items():
         row = next(line for line in page.splitlines() if line.startswith(f"| `{name}`"))
-        unit = "steps" if weights.time_unit == "steps" else "log10 seconds"
+        unit = weights.time_unit.replace("-", " ")
         assert row.endswith(f"| {weights.alpha_time:g} | {weights.alpha_price:g} | {weights.success} | {unit} |")

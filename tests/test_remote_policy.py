@@ -139,8 +139,20 @@ def test_a_server_that_is_gone_fails_calls_not_resets(tmp_path):
     assert "closed the connection" in call.failure and call.seconds == 2.0
     assert "127.0.0.1" not in call.failure  # goes into the journal, where a random port must not be
     remote.reset("x", (2,))
-    assert "Connection refused" in remote.call(observation("x")).failure
+    unreached = remote.call(observation("x"))
+    assert "Connection refused" in unreached.failure and unreached.seconds == 2.0
+    assert call.sent is False and unreached.sent is False
     remote.close()
+
+
+def test_a_question_without_an_answer_was_a_call(tmp_path):
+    with serving_with(lambda connection: connection.recv(timeout=5), pack({"model": "pi0"})) as url:
+        remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, timeout=2))
+        remote.reset("x", (1,))
+        call = remote.call(observation("x"))
+        assert "closed the connection" in call.failure and call.sent
+        assert not remote.call(observation("x")).sent
+        remote.close()
 
 
 def test_a_call_before_any_reset_fails(tmp_path):
@@ -220,6 +232,17 @@ def test_a_server_that_does_not_start_says_why(plugin, kind, reason):
     with pytest.raises(RemoteError, match=reason), PolicyServerProcess(policy_spec(plugin, kind=kind), ENVIRONMENT, start_timeout=60):
         pass
     assert time.monotonic() - start < 30
+
+
+@pytest.mark.parametrize("kind", ["chatty", "chatty_broken"])
+def test_what_a_plugin_prints_while_it_loads_is_not_the_servers_word(plugin, kind):
+    server = PolicyServerProcess(policy_spec(plugin, kind=kind), ENVIRONMENT, timeout=10, start_timeout=60)
+    if kind == "chatty":
+        with server, server.start_client() as client:
+            assert client.act(observation()).actions.shape == (8, 7)
+        return
+    with pytest.raises(RemoteError, match="the weights are on holiday"):
+        server.start()
 
 
 def test_a_server_that_takes_too_long_to_start(plugin):

@@ -73,6 +73,12 @@ def test_serves_our_client_and_openpis_and_stops_when_told(folder, number, code)
         assert server.process.stderr.read() == ""
 
 
+def test_what_a_plugin_prints_does_not_come_before_the_line(folder):
+    policy_spec(folder, name="loud", kind="loud")
+    with Serving(folder, "loud", OSEL_SIM_TOKEN=TOKEN) as server:
+        assert server.ready["policy"] == "loud"
+
+
 def test_makes_a_token_of_its_own_on_loopback(folder):
     with Serving(folder, "sinusoid") as server, RemoteClient(server.ready["url"], ENVIRONMENT, server.ready["token"], timeout=5) as client:
         client.reset("x")

@@ -115,7 +115,7 @@ class LoggedOutcomes:
         ran = np.isfinite(self.success)
         for name, values, weight, remedy in (
             (weights.success, score, 1.0, "choose success instead"),
-            ("times" if weights.time_unit == "log10-seconds" else "steps", time, weights.alpha_time, "give --alpha-time 0"),
+            ("times" if weights.clock == "seconds" else "steps", time, weights.alpha_time, "give --alpha-time 0"),
             ("prices", price, weights.alpha_price, "give --alpha-price 0"),
         ):
             if weight > 0.0 and ran.any() and not np.isfinite(values).any():

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from osel_sim.analysis.log import LoggedOutcomes
-from osel_sim.analysis.measures import curves, measure_selector, paired
+from osel_sim.analysis.measures import curves, measure_selector, oracle_interval, paired
 from osel_sim.analysis.oracles import Oracles
 from osel_sim.analysis.streams import LeftOut
 from osel_sim.analysis.verdict import reward_span, verdict
@@ -66,7 +66,7 @@ def build(
         "oracles": {
             name: {
                 "mean_reward": float(values.mean()),
-                "ci95": list(rewards.interval(name, values)),
+                "ci95": list(oracle_interval(rewards, name, choices.order)),
                 "mean_reward_late": float(values[:, rewards.late :].mean()),
             }
             for name, values in rewards.oracles.items()

@@ -70,22 +70,22 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
 
 def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordResult:
     from osel_sim.context.encoder import load_encoder
-    from osel_sim.core.files import read_json, write_json
+    from osel_sim.core.files import write_json
     from osel_sim.episodes.declared_skills import declare
     from osel_sim.episodes.recording import Recording
-    from osel_sim.formats.run_config import RUN, check_run_folder, start_or_resume
+    from osel_sim.formats.run_config import RUN, check_run_folder, read_run, start_or_resume
     from osel_sim.suites.ran_with import ran_with
 
     plan = _plan(config)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
-    before = read_json(folder / RUN) if config.resume and (folder / RUN).exists() else None
-    known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
+    before = read_run(folder) if config.resume and (folder / RUN).exists() else None
+    known = configuration if before is None else _as_it_began(configuration, before["configuration"])
     check_run_folder(folder, known, config.resume)
     encoder = load_encoder(plan.encoder)
     skills = declare(plan.policies, encoder, plan.tasks, config.tasks)
     configuration["encoder"] = encoder.identity
     # An encoder that was given is added; the one that was there must not have changed.
-    known["encoder"] = before.get("configuration", {}).get("encoder") if before and encoder_given else encoder.identity
+    known["encoder"] = before["configuration"].get("encoder") if before and encoder_given else encoder.identity
     for warning in start_or_resume(folder, known, ran_with(plan.tasks), config.resume, config.to_json()):
         logger.warning(warning)
     recording = Recording(folder, plan, encoder.identity, skills)
@@ -155,13 +155,12 @@ def _configuration(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
 
 def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
     """The settings that a recording began with; policies, repeats and an encoder that were given come in addition."""
-    from osel_sim.core.files import read_json
-    from osel_sim.formats.run_config import RUN, check_run_folder
+    from osel_sim.formats.run_config import RUN, check_run_folder, read_run
     from osel_sim.interface.robot import DEFAULT_ROBOT
 
     folder = cast(Path, config.out)
     check_run_folder(folder, {}, resume=True)
-    began = read_json(folder / RUN).get("configuration", {})
+    began = read_run(folder)["configuration"]
     try:
         values = {name: began[key] for name, key in _FIXED.items()}
         values["axis"] = tuple(part for axes in began["axes"] for part in axes.split(","))
@@ -181,6 +180,8 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
     except KeyError as missing:
         raise DataError(f"{folder / RUN}: not of a recording by this version, it has no {missing}; give all flags it was made with") from None
+    except (TypeError, AttributeError) as error:
+        raise DataError(f"{folder / RUN}: configuration does not have the promised form ({error})") from None
     return config.changed(**values)
 
 

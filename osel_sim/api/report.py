@@ -68,7 +68,7 @@ def report(folder: "Path | str | ReportConfig", **values: Any) -> ReportResult:
 
 
 def _page(config: ReportConfig) -> "Page":
-    from osel_sim.analysis.live import JOURNAL
+    from osel_sim.formats.journal import JOURNAL
     from osel_sim.formats.replay_result import REPLAY
     from osel_sim.formats.rollout_log import ROLLOUTS
 

@@ -1,6 +1,8 @@
 """The tasks, robots, policies and suites there are, for `python -m osel_sim.run --list`: reads TOML and imports no simulator."""
 
+import contextlib
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -35,28 +37,28 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
 
 def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Path | None = None) -> None:
     """Print the listing as tables, or as JSON."""
-    found = listing(tasks, policies)
+    with contextlib.redirect_stdout(sys.stderr):  # what plugins print while they load is no part of it
+        found = listing(tasks, policies)
     if as_json:
         print(json.dumps(found, indent=2))
         return
-    from rich.table import Table
+    from osel_sim.cli.console import Table, console, plain
 
-    from osel_sim.cli.console import console
-
-    table = Table("task", "title", "tags", "steps", title="Tasks", title_justify="left")
+    columns = ("task", "title", "tags", "steps")
+    table = Table("Tasks", columns)
     for task in found["tasks"]:
-        table.add_row(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
+        table.add(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
     console().print(table)
     console().print(f"Robots, for --robot: {', '.join(robot['name'] for robot in found['robots'])}; {DEFAULT_ROBOT} unless a task file names another")
     for suite in found["suites"]:
-        table = Table("task", "title", "tags", "steps", title=f"Tasks of {suite['name']}: {suite['title']}", title_justify="left")
+        table = Table(f"Tasks of {suite['name']}: {suite['title']}", columns)
         for task in suite["tasks"]:
-            table.add_row(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
-        console().print(table if suite["problem"] is None else f"{suite['name']}: {suite['problem']}")
-    table = Table("policy", "title", "where", "kind", title="Policies", title_justify="left")
+            table.add(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
+        console().print(table if suite["problem"] is None else plain(f"{suite['name']}: {suite['problem']}"))
+    table = Table("Policies", ("policy", "title", "where", "kind"))
     for policy in found["policies"]:
         where = "local" if policy["remote"] is None else f"remote ({policy['remote']['network']})"
-        table.add_row(policy["name"], policy["title"], where + (", privileged" if policy["privileged"] else ""), policy["kind"])
+        table.add(policy["name"], policy["title"], where + (", privileged" if policy["privileged"] else ""), policy["kind"])
     console().print(table)
 
 

@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from osel_sim.core.shown import shown
+
 
 class Bar:
     """A progress bar that is being shown."""
@@ -22,7 +24,7 @@ class Bar:
 
     def note(self, text: str) -> None:
         """Show a text behind the bar from its next update on."""
-        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.set_postfix_str(_line(text), refresh=False)
 
 
 @contextmanager
@@ -41,5 +43,11 @@ def progress(
     """
     from tqdm.auto import tqdm  # type: ignore[import-untyped]
 
-    with tqdm(total=total, initial=initial, unit=unit, unit_scale=scale, desc=description, dynamic_ncols=True, disable=quiet) as bar:
+    desc = None if description is None else _line(description)
+    with tqdm(total=total, initial=initial, unit=unit, unit_scale=scale, desc=desc, dynamic_ncols=True, disable=quiet) as bar:
         yield Bar(bar)
+
+
+def _line(text: str) -> str:
+    """A text as one line: names of others stand in it, and a bar is drawn over and over on its line."""
+    return shown(text).replace("\n", " ").replace("\t", " ")

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from osel_sim.episodes.loop import Subscriber
 from osel_sim.episodes.subscribers import RealTime, Timing
 from osel_sim.episodes.video import Video
-from osel_sim.formats.journal import Decision, Lines
+from osel_sim.formats.journal import TIMING, Decision, Lines
 
-TIMING, VIDEOS = "timing.jsonl", "videos"
+VIDEOS = "videos"
 
 
 class Run(Protocol):

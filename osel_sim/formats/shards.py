@@ -5,15 +5,20 @@ It goes into the rollout log when all instances are recorded. An instance has se
 
 import base64
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError
 from osel_sim.formats.journal import Lines
-from osel_sim.formats.rollout_log import Row
+from osel_sim.formats.rollout_log import Row, row_fault
+from osel_sim.formats.toml_types import quoted
+from osel_sim.formats.values import NAME, ROW, TEXT, Kind, fault
 
 SHARDS = "shards.jsonl"
+_ROWS = Kind("a list of objects", lambda value: isinstance(value, list) and all(isinstance(item, dict) for item in value))
+_SHARD = {"instance": NAME, "rows": _ROWS, "encoder": NAME, "context": TEXT.or_null}
 
 
 class Shards:
@@ -29,13 +34,12 @@ class Shards:
         self.rows: dict[str, dict[tuple[str, int], Row]] = {}
         self.contexts: dict[str, dict[str, NDArray[np.float32]]] = {}
         for number, (data, _) in enumerate(self._lines.rows, 1):
-            try:
-                key, encoder, context = data["instance"], data["encoder"], data["context"]
-                self._put(key, [Row(**row) for row in data["rows"]])
-                if context is not None:
-                    self.contexts.setdefault(encoder, {})[key] = np.frombuffer(base64.b64decode(context), "<f4").astype(np.float32)
-            except (KeyError, TypeError, ValueError) as error:
-                raise DataError(f"{self._lines.file}, line {number}: not a recorded instance ({error})") from None
+            place = f"{self._lines.file}, line {number}"
+            if problem := fault(data, _SHARD):
+                raise DataError(f"{place}: not a recorded instance ({problem})")
+            self._put(data["instance"], [_row(row, data["instance"], place) for row in data["rows"]])
+            if data["context"] is not None:
+                self.contexts.setdefault(data["encoder"], {})[data["instance"]] = _context(data["context"], place)
 
     def add(self, instance: str, rows: list[Row], encoder: str, context: NDArray[np.float32] | None) -> None:
         """Write one instance and wait until it is on disk."""
@@ -53,3 +57,22 @@ class Shards:
         self._lines.close()
         if remove:
             self._lines.file.unlink(missing_ok=True)
+
+
+def _row(data: dict[str, Any], instance: str, place: str) -> Row:
+    if problem := fault(data, ROW, optional=("score", "axes", "robot")):
+        raise DataError(f"{place}: not a recorded instance ({problem})")
+    row = Row(**data)
+    if row.instance != instance or (problem := row_fault(row)):
+        raise DataError(f"{place}: not a recorded instance ({problem if row.instance == instance else f'a row is of {quoted(row.instance)}'})")
+    return row
+
+
+def _context(text: str, place: str) -> NDArray[np.float32]:
+    try:
+        context = np.frombuffer(base64.b64decode(text, validate=True), "<f4").astype(np.float32)
+    except ValueError as error:
+        raise DataError(f"{place}: its context cannot be read ({error})") from None
+    if not context.size or not np.isfinite(context).all():
+        raise DataError(f"{place}: its context is not all finite numbers")
+    return context

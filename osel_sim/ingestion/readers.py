@@ -212,7 +212,7 @@ def _parquet(file: Path) -> Iterator[Record]:
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise DataError(f"{file}: column {twice!r} is there twice")
-        rows = pyarrow.parquet.read_table(file).to_pylist()
+        rows = pyarrow.parquet.read_table(file, page_checksum_verification=True).to_pylist()
     except (pyarrow.ArrowException, ValueError) as error:
         reason = str(error).splitlines()[0]
         raise DataError(f"{file}: is not a whole Parquet file ({reason})") from None

@@ -26,6 +26,10 @@ MAX_ANSWER = 16 << 20  # bytes; a chunk of 1,000 actions has 56,000
 CLOSE_SECONDS = 1.0
 
 
+class UnsentError(RemoteError):
+    """The question never left this machine."""
+
+
 @dataclass(frozen=True)
 class Answer:
     """What came back for one observation.
@@ -134,12 +138,13 @@ class RemoteClient:
         """Actions for one observation.
 
         Raises:
+            UnsentError: the connection was closed before, or the server sent something before it was asked.
             RemoteError: timeout, closed, an error message, or an answer without proper actions.
         """
         start = time.perf_counter()
         environment = self._environment
         if self._connection is None:
-            raise RemoteError(f"{self.url}: not connected")
+            raise UnsentError(f"{self.url}: not connected")
         reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation), environment) if self.foreign else observation)
         measured = time.perf_counter() - start
         key = self._mapping.actions if self.foreign else "actions"
@@ -192,7 +197,8 @@ class RemoteClient:
 
     def _ask(self, message: Any) -> tuple[Any, int]:
         if self._connection is None:
-            raise RemoteError(f"{self.url}: not connected")
+            raise UnsentError(f"{self.url}: not connected")
+        self._check_silent(self._connection)
         end = time.monotonic() + self._timeout
         frame = pack(message)
         try:
@@ -201,6 +207,18 @@ class RemoteClient:
             full = isinstance(error.__cause__, BlockingIOError)  # what SO_SNDTIMEO makes of a full buffer
             raise self._fail(f"took no message within {self._timeout:g} s" if full else f"closed the connection ({error})") from None
         return self._decode(self._receive(end), "answer"), len(frame)
+
+    def _check_silent(self, connection: ClientConnection) -> None:
+        """Refuse an answer that lies ready before its question: a server that answers twice would shift all answers by one, unnoticed."""
+        try:
+            early = connection.recv(timeout=0)
+        except TimeoutError:
+            return
+        except (ConnectionClosed, OSError) as error:
+            raise self._fail(f"closed the connection ({error})", UnsentError) from None
+        if isinstance(early, str):
+            raise self._fail(_reported(early), UnsentError)
+        raise self._fail("sent a message that nobody asked for: it must answer each message once", UnsentError)
 
     def _receive(self, end: float) -> str | bytes:
         if self._connection is None:
@@ -214,17 +232,21 @@ class RemoteClient:
 
     def _decode(self, frame: str | bytes, what: str) -> Any:
         if isinstance(frame, str):
-            # openpi sends a whole traceback; its last line is the error.
-            lines = frame.strip().splitlines() or [""]
-            raise self._fail(f"reported an error: {lines[-1][:300]}")
+            raise self._fail(_reported(frame))
         try:
             return unpack(frame)
         except ProtocolError as error:
             raise self._fail(f"its {what} is unreadable: {error}") from None
 
-    def _fail(self, reason: str) -> RemoteError:
+    def _fail(self, reason: str, kind: type[RemoteError] = RemoteError) -> RemoteError:
         self.close()
-        return RemoteError(f"{self.url}: {reason}")
+        return kind(f"{self.url}: {reason}")
+
+
+def _reported(text: str) -> str:
+    """What a text message says went wrong: openpi sends a whole traceback, whose last line is the error."""
+    lines = text.strip().splitlines() or [""]
+    return f"reported an error: {lines[-1][:300]}"
 
 
 def _cameras(observation: Observation) -> tuple[str, ...]:

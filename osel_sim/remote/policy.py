@@ -11,7 +11,7 @@ from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Observation
 from osel_sim.policy.environment_fit import check_environment
 from osel_sim.policy.mapping import message_of
-from osel_sim.remote.client import Answer, RemoteClient
+from osel_sim.remote.client import Answer, RemoteClient, UnsentError
 from osel_sim.remote.network import Delays, NetworkModel, NetworkProfile, profile
 from osel_sim.remote.process import PolicyServerProcess
 from osel_sim.remote.protocol import STATE, TOKEN_VARIABLE, Greeting, example_observation, select_observation
@@ -46,6 +46,7 @@ class RemotePolicy:
         self._profile = network or profile(spec.remote.network)
         self._network = NetworkModel(self._profile, ())
         self._broken: str | None = "no episode was started"
+        self._sent = False
 
     def reset(self, instruction: str, seed: tuple[int, ...]) -> None:
         """Start a new episode, on a new connection if the last one broke. A server that cannot be reached makes the calls fail, not this."""
@@ -74,7 +75,7 @@ class RemotePolicy:
         megabytes = 1e-6 * sum(sizes)
         deadline = self._remote.deadline
         if answer is None:
-            return Call(None, upload=deadline, measured_seconds=measured, failure=self._broken)
+            return Call(None, upload=deadline, measured_seconds=measured, failure=self._broken, sent=self._sent)
         if delays.total > deadline:
             upload, inference, download = _cut(delays, deadline)
             failure = OUTAGE if delays.total - delays.outage <= deadline else DEADLINE
@@ -95,12 +96,13 @@ class RemotePolicy:
             self._client = self._server.start_client()
 
     def _ask(self, observation: Observation) -> Answer | None:
-        if self._broken is not None:
+        self._sent = self._broken is None
+        if not self._sent:
             return None
         try:
             return self._client.act(select_observation(observation, self._spec.cameras, STATE in observation))
         except RemoteError as error:
-            self._broken = self._reason(error)
+            self._broken, self._sent = self._reason(error), not isinstance(error, UnsentError)
             return None
 
     def _reason(self, error: RemoteError) -> str:

@@ -2,12 +2,10 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from osel_sim.analysis.clusters import complete_rows
 from osel_sim.analysis.estimate import Estimate
 from osel_sim.analysis.log import LoggedOutcomes
-from osel_sim.analysis.outcomes import remote_policies
+from osel_sim.analysis.outcomes import overall, remote_policies
 from osel_sim.core.errors import DataError
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, cluster_blocks, frontier_figure, weights_blocks
@@ -108,10 +106,12 @@ def _verdict(log: LoggedOutcomes, weights: RewardWeights, routing: Routing | Non
     rewards = log.mean_rewards(weights)[complete_rows(log, weights)]
     means = rewards.mean(axis=0)
     best, oracle = int(means.argmax()), float(rewards.max(axis=1).mean())
-    success = float(np.nanmean(log.success[:, best]))
+    always = overall(log, weights)[best]  # as the table of policies has it
+    reward, success = always.reward, always.success
+    rate = f"95% [{100 * success.low:.0f}, {100 * success.high:.0f}]" if success else ""
     tiles = [
-        Tile("best single policy", log.policies[best], f"mean reward {means[best]:.3f}"),
-        Tile("its success", f"{100 * success:.0f}%"),
+        Tile("best single policy", log.policies[best], f"mean reward {reward.value:.3f}, 95% {interval(reward)}" if reward else ""),
+        Tile("its success", f"{100 * success.value:.0f}%" if success else "–", rate),
         Tile("hindsight oracle", f"{oracle:.3f}", "mean reward; optimistic, not learnable where outcomes are noisy"),
     ]
     held_out = routing.inequality.held_out if routing else None

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from osel_sim.analysis.estimate import Estimate
+from osel_sim.analysis.off_policy import LEAST_EFFECTIVE, WAYS
 from osel_sim.reporting.html_tables import Cell, Column, Table
 
 
@@ -14,19 +15,23 @@ def off_policy_table(found: Mapping[str, Any]) -> Table:
         found: as `osel_sim.analysis.evaluation.evaluate` returns it.
     """
     run = found["run"]
-    received: dict[str, Cell] = dict.fromkeys(("ips", "snips"))
-    received |= {"who": f"{run['selector']} (as it was)", "dr": _estimate(run, "mean_reward", "ci95"), "effective": float(run["decisions"])}
-    rows: list[dict[str, Cell]] = [received]
+    nothing = {key: None for way in WAYS for key in (way, f"{way}_effective")}
+    received = Estimate(float(run["mean_reward"]), float(run["ci95"][0]), float(run["ci95"][1]))
+    rows: list[dict[str, Cell]] = [{"who": f"{run['selector']} (as it was)", "measured": received, **nothing}]
     for name, entry in found["targets"].items():
-        estimates = {key: _estimate(entry, key, f"{key}_ci95") for key in ("ips", "snips", "dr")}
-        rows.append({"who": name.replace("fixed:", "always "), **estimates, "effective": float(entry["effective_decisions"])})
-    columns = [
-        *(Column("who", "way of choosing", "text"), Column("ips", "IPS", digits=3), Column("snips", "SNIPS", digits=3)),
-        *(Column("dr", "doubly robust", digits=3), Column("effective", "effective decisions", digits=0)),
-    ]
+        estimates = {way: None if way in entry["few"] else _estimate(entry, way, f"{way}_ci95") for way in WAYS}
+        effective = {f"{way}_effective": float(entry[f"{way}_effective"]) for way in WAYS}
+        rows.append({"who": name.replace("fixed:", "always "), "measured": entry["measured"], **estimates, **effective})
+    headings = {"ips": "IPS", "snips": "SNIPS", "dr": "doubly robust"}
+    columns = [Column("who", "way of choosing", "text"), Column("measured", "measured", digits=3)]
+    for way in WAYS:
+        columns += [Column(way, headings[way], digits=3), Column(f"{way}_effective", "effective decisions", digits=0)]
     caption = (
-        "Mean reward a decision with 95% intervals, from the probabilities with which this run chose and the outcomes of what it chose alone. "
-        "Greedy: the policy of the highest reward by a linear model of earlier decisions. A dash: the run could never have chosen so."
+        "Mean reward a decision with 95% intervals. Measured: from the outcomes themselves, where the run has them. Estimates: from the "
+        "probabilities with which this run chose and the outcomes of what it chose alone, as if the others were not known. "
+        f"Each has the number of decisions that it rests on; one that rests on fewer than {LEAST_EFFECTIVE:.0f} is not shown. "
+        "IPS takes the mean weight for 1: where the run chose a policy more often than it meant to, IPS is too high by as much. "
+        "Greedy: the policy of the highest reward by a linear model of earlier decisions. A dash: too few, or the run could never have chosen so."
     )
     return Table("off_policy", "What other ways of choosing would have earned", caption, columns, rows)
 

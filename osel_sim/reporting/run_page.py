@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from osel_sim.analysis.clusters import score_of
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.evaluation import evaluate
-from osel_sim.analysis.live import JOURNAL, LiveLog, read_live
+from osel_sim.analysis.live import LiveLog, read_live
 from osel_sim.analysis.log import Array, LoggedOutcomes
 from osel_sim.core.errors import DataError
-from osel_sim.core.files import read_json
-from osel_sim.formats.journal import Decision, read_journal
-from osel_sim.formats.run_config import RUN
+from osel_sim.formats.journal import Decision
+from osel_sim.formats.run_config import read_run
 from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, thinned
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes
@@ -53,7 +52,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     look = _look(run, streams)
     blocks: list[Block] = [curve_figure(streams, look, run.log.policies)]
     if HINDSIGHT in streams:
-        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look)]
+        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look, np.arange(len(run.chosen))[None])]
     blocks += [_propensities(run), _chosen_table(run, selector)]
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
@@ -105,11 +104,7 @@ class _Run:
 
 def _read(folder: Path) -> _Run:
     live = read_live(folder)
-    try:
-        weights = RewardWeights(**live.reward)
-    except TypeError as error:
-        raise DataError(f"{folder / RUN}: configuration.reward does not have the promised form ({error})") from None
-    return _Run(folder, live, read_journal(folder / JOURNAL), weights)
+    return _Run(folder, live, live.decisions, RewardWeights(**live.reward))
 
 
 def _streams(run: _Run, selector: str) -> dict[str, Stream]:
@@ -220,7 +215,7 @@ def _mean_tiles(stream: Stream) -> list[Tile]:
 
 
 def _facts(run: _Run) -> list[tuple[str, str]]:
-    ran_with = read_json(run.folder / RUN).get("environment", {})
+    ran_with = read_run(run.folder)["environment"]
     own = {key: value for key, value in run.configuration.items() if key not in ("reward", "content")}
     facts = [("folder", str(run.folder)), *((key, _words(value)) for key, value in own.items()), ("reward", formula(run.weights))]
     facts += [(name, str(digest)[:12]) for name, digest in dict(run.configuration.get("content") or {}).items()]
