@@ -32,7 +32,7 @@ class IngestConfig(TrustSettings):
     out: Annotated[Path | None, MAIN] = None
     """where to write"""
     map: Annotated[Path | None, MAIN] = None
-    """mapping file; it alone says what the columns mean"""
+    """mapping file; it alone says what a table's columns mean, or with action-mse which names and conventions of the datasets are others"""
     files: Annotated[Names | None, MAIN] = None
     """tables: .csv, .tsv, .jsonl or .parquet; * stands for anything, {NAME} makes a column of it"""
     encoder: Annotated[str | None, MAIN] = None
@@ -141,7 +141,7 @@ def ingest(config: IngestConfig | None = None, /, **values: Any) -> IngestResult
         raise SettingError("out", "is missing: give the folder to write to")
     with trusting(config.trust):
         if config.metric == "action-mse":
-            _refuse(config, (*TABLE_FLAGS, "map", "files"), "--metric action-mse")
+            _refuse(config, (*TABLE_FLAGS, "files"), "--metric action-mse")
             return _action_mse(config, config.out)
         _refuse(config, ("dataset", "policies_dir", "camera", "frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
         return _table(config, config.out)
@@ -199,6 +199,7 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF
     from osel_sim.episodes.drivers import choose_policies
+    from osel_sim.formats.dataset_mapping import load_dataset_mapping
     from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
     from osel_sim.sim.specification import specification
@@ -213,16 +214,17 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
         if not (camera and equals and column):
             raise SettingError("camera", f"must be CAMERA=COLUMN, got {item!r}")
         cameras[camera] = column
-    measured = Measurement(config.frames or 4, 0.05 if config.tolerance is None else config.tolerance, cameras)
+    mapping = load_dataset_mapping(config.map)
+    measured = Measurement(config.frames or 4, 0.05 if config.tolerance is None else config.tolerance, cameras, mapping, config.map)
     samples = open_datasets(config.dataset, specs, measured)
     instances = [sample.instance for sample in samples]
     inputs = check_out(out, instances)
+    name, texts = config.encoder or f"{DEFAULT_ENCODER}+{TFIDF}", [item.text for item in instances]
+    encoder = load_log_encoder(name, texts, True, config.device)  # one that cannot be loaded is found before the policies are asked, not after
     rows, source = measure_errors(samples, specs, measured)
     # By `metric`, replay and report know that what counts is the score.
     metadata = {"task": "action-mse", "policies": [spec.name for spec in specs], "source": {"metric": "action-mse", **source}}
-    texts = [item.text for item in instances]
-    name = config.encoder or f"{DEFAULT_ENCODER}+{TFIDF}"
-    identity = write_log(out, inputs, rows, instances, lambda: load_log_encoder(name, texts, True, config.device), metadata)
+    identity = write_log(out, inputs, rows, instances, lambda: encoder, metadata)
     return _result(config, out, rows, identity, start)
 
 

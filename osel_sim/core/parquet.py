@@ -1,0 +1,55 @@
+"""Parquet files of others: only the columns that are wanted are read, and whatever is wrong with a file is one line."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from osel_sim.core.arrays import check_rows
+from osel_sim.core.errors import DataError, did_you_mean
+
+PARQUET_ERRORS = (OSError, ValueError, LookupError, TypeError, OverflowError, ArithmeticError, NotImplementedError, RuntimeError, MemoryError)
+"""What pyarrow raises for damaged files, and for types and values it cannot turn into others: its own errors are kinds of these."""
+
+
+def parquet_columns(file: Path) -> list[str]:
+    """The names of a file's columns.
+
+    Raises:
+        DataError: it cannot be read, claims more rows than it can hold, or has a column twice.
+    """
+    import pyarrow.parquet
+
+    try:
+        names: list[str] = pyarrow.parquet.read_schema(file).names
+        check_rows(file)
+    except PARQUET_ERRORS as error:
+        raise unreadable(file, error) from None
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise DataError(f"{file}: column {twice!r} is there twice")
+    return names
+
+
+def read_parquet(file: Path, columns: Sequence[str]) -> Any:
+    """These columns of a file, as a `pyarrow.Table`. What others hold does not matter: it is not read.
+
+    Raises:
+        DataError: it cannot be read, or lacks a column.
+    """
+    import pyarrow.parquet
+
+    names = parquet_columns(file)
+    for column in columns:
+        if column not in names:
+            raise DataError(f"{file}: there is no column {column!r}: {did_you_mean(column, names)}columns: {', '.join(names)}")
+    try:
+        # pyarrow takes the dots of a name for a path, which a column of the same beginning would match as well.
+        return pyarrow.parquet.read_table(file, columns=list(columns), partitioning=None).select(list(columns))
+    except PARQUET_ERRORS as error:
+        raise unreadable(file, error) from None
+
+
+def unreadable(file: Path, error: Exception) -> DataError:
+    """What is wrong with a file, in one line, to be raised."""
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else (str(error).splitlines() or [""])[0]
+    return DataError(f"{file}: is not a whole Parquet file ({reason[:200] or type(error).__name__})")
