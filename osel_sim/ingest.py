@@ -22,11 +22,18 @@ EXAMPLES = """examples:
   python -m osel_sim.ingest --files episodes.jsonl --text instruction --group task_type --policy-column model --repeat-column trial \\
       --success solved --subgoals fraction --steps steps --price cents --out logs/alfred
 
+  # other units, nested JSON
+  python -m osel_sim.ingest --files answers.jsonl --text question --policy-column model --success scores.exact --seconds time_ms/1000 \\
+      --price usage.usd --price-unit usd --out logs/theirs
+
+  # decisions that were made, with the probability of each choice: what would others have earned?
+  python -m osel_sim.ingest --files requests.parquet --text prompt --policy-column model --success ok --propensity p --out logs/requests
+
   # minus the error of the actions that policies would have taken on logged observations (Open X-Embodiment)
   python -m osel_sim.ingest --metric action-mse --dataset data/bridge data/fractal --policies local_small remote_large --out logs/oxe
 
 Writes rollouts.parquet and contexts.npz into --out, nothing if the table is wrong. The same command goes on with an interrupted encoding, and another
---encoder adds its contexts to the log. How a mapping file looks: the top of osel_sim/ingestion/columns.py."""
+--encoder adds its contexts to the log. How a mapping file looks, and all that is taken: docs/tables.md."""
 
 
 def _execute(config: IngestConfig) -> int:

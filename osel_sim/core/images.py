@@ -2,6 +2,7 @@
 
 import functools
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ def load_image(source: Path | bytes, where: str) -> NDArray[np.uint8]:
     try:
         with pillow.open(source if isinstance(source, Path) else io.BytesIO(source)) as image:
             if image.width * image.height > MOST_PIXELS:
-                raise DataError(_too_large(where, name, f"has {image.width} x {image.height} pixels"))
+                raise DataError(_too_large(where, name, f"{image.width} x {image.height} pixels"))
             if image.mode.startswith(_WIDE):
                 raise DataError(
                     f"{where}: {name} has more than 8 bits a channel (mode {image.mode!r}); save it with 8, scaled to the range that matters"
@@ -42,7 +43,8 @@ def load_image(source: Path | bytes, where: str) -> NDArray[np.uint8]:
                 upright = upright.convert("RGBA")  # Pillow warns of palettes with transparency otherwise
             return np.asarray(upright.convert("RGB"), np.uint8)
     except (pillow.DecompressionBombError, pillow.DecompressionBombWarning) as error:
-        raise DataError(_too_large(where, name, str(error).partition(" exceeds")[0].lower())) from None
+        pixels = re.search(r"\d+ pixels", str(error))
+        raise DataError(_too_large(where, name, pixels[0] if pixels else "a decompression bomb")) from None
     # Pillow says SyntaxError for a broken PNG, and others for broken chunks of any format.
     except (OSError, ValueError, SyntaxError, EOFError, IndexError, KeyError, TypeError, OverflowError, MemoryError, ZeroDivisionError) as error:
         reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -50,7 +52,7 @@ def load_image(source: Path | bytes, where: str) -> NDArray[np.uint8]:
 
 
 def _too_large(where: str, name: str, size: str) -> str:
-    return f"{where}: {name} is too large ({size}; at most {MOST_PIXELS} pixels); save a smaller one"
+    return f"{where}: {name} is too large ({size}, at most {MOST_PIXELS}); save a smaller one"
 
 
 def _without_object(reason: str) -> str:

@@ -1,6 +1,6 @@
 """Parquet files of others: only the columns that are wanted are read, and whatever is wrong with a file is one line."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,11 @@ PARQUET_ERRORS = (OSError, ValueError, LookupError, TypeError, OverflowError, Ar
 """What pyarrow raises for damaged files, and for types and values it cannot turn into others: its own errors are kinds of these."""
 
 
-def parquet_columns(file: Path) -> list[str]:
+def parquet_columns(file: Path, wanted: Collection[str] = ()) -> list[str]:
     """The names of a file's columns.
 
     Raises:
-        DataError: it cannot be read, claims more rows than it can hold, or has a column twice.
+        DataError: it cannot be read, claims more rows than it can hold, or has a column twice that is wanted.
     """
     import pyarrow.parquet
 
@@ -24,10 +24,17 @@ def parquet_columns(file: Path) -> list[str]:
         check_rows(file)
     except PARQUET_ERRORS as error:
         raise unreadable(file, error) from None
-    twice = next((name for name in names if names.count(name) > 1), None)
+    twice = next((name for name in wanted if names.count(name) > 1), None)
     if twice is not None:
         raise DataError(f"{file}: column {twice!r} is there twice")
     return names
+
+
+def parquet_rows(file: Path) -> int:
+    """How many rows a file has that can be read."""
+    import pyarrow.parquet
+
+    return int(pyarrow.parquet.read_metadata(file).num_rows)
 
 
 def read_parquet(file: Path, columns: Sequence[str]) -> Any:
@@ -38,7 +45,7 @@ def read_parquet(file: Path, columns: Sequence[str]) -> Any:
     """
     import pyarrow.parquet
 
-    names = parquet_columns(file)
+    names = parquet_columns(file, columns)
     for column in columns:
         if column not in names:
             raise DataError(f"{file}: there is no column {column!r}: {did_you_mean(column, names)}columns: {', '.join(names)}")
