@@ -94,9 +94,10 @@ def remote_policies(log: LoggedOutcomes) -> tuple[NDArray[np.bool_], str]:
         remote = (values > 0.0).any(axis=(0, 2))
         if remote.any() and not remote.all():
             return remote, reason
-    rates = np.nanmean(mean_over_repeats(log.success), axis=0)
+    columns = [values[np.isfinite(values)] for values in mean_over_repeats(log.success).T]
+    rates = [values.mean() if values.size else np.inf for values in columns]  # one that was never tried is not the one with the lowest
     remote = np.ones(len(log.policies), bool)
-    remote[int(np.nanargmin(rates))] = False
+    remote[int(np.argmin(rates))] = False
     return remote, "local: the policy with the lowest success, as in the paper, because the log has no network times or prices that tell"
 
 
