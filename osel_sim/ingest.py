@@ -1,9 +1,14 @@
 """Turn outcome tables of others into a rollout log: `python -m osel_sim.ingest --map mapping.toml --out logs/theirs`."""
 
+import shlex
 import sys
+from typing import TYPE_CHECKING
 
 from osel_sim.api.ingest import IngestConfig
 from osel_sim.cli.command import Command
+
+if TYPE_CHECKING:
+    from osel_sim.api.ingest import IngestResult
 
 EXAMPLES = """examples:
   # a mapping file says what the columns mean (examples/mmlu.toml)
@@ -48,8 +53,18 @@ def _execute(config: IngestConfig) -> int:
     print(f"{result.folder}: {len(result.rows)} rows, contexts of {result.encoder}, {result.seconds:.0f} s")
     print_rollouts(console(), result.rows, weights)
     print(f"reward ({preset}): {weights.success} - {weights.alpha_time} {weights.time_unit} - {weights.alpha_price} cents")
-    print(f"written to {result.folder}; python -m osel_sim.replay {result.folder} --preset {preset} replays it to selectors")
+    print(f"written to {result.folder}; python -m osel_sim.replay {shlex.quote(str(result.folder))}{_flags(result, preset)} replays it to selectors")
     return 0
+
+
+def _flags(result: "IngestResult", preset: str) -> str:
+    """Flags for a replay by the same weights, as far as the log knows what they weigh."""
+    from osel_sim.api.reward import DEFAULT_PRESET
+
+    frame = result.outcomes
+    flags = "" if preset == DEFAULT_PRESET else f" --preset {preset}"
+    flags += " --alpha-time 0" if frame[["steps", "upload", "inference", "download", "motion"]].isna().all(axis=None) else ""
+    return flags + (" --alpha-price 0" if frame["price"].isna().all() else "")
 
 
 main = Command("ingest", IngestConfig, _execute, EXAMPLES)

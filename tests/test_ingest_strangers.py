@@ -13,6 +13,7 @@ from PIL import Image
 
 from osel_sim.core.errors import DataError, OselError
 from osel_sim.core.images import load_image
+from osel_sim.ingest import main as ingest_main
 from osel_sim.ingestion.columns import COMMAND_LINE
 from osel_sim.ingestion.columns_file import load_columns, parse_columns
 from osel_sim.ingestion.convert import Converted, convert
@@ -116,6 +117,7 @@ def test_a_folder_of_parts_is_a_table(tmp_path: Path) -> None:
         file.parent.mkdir(parents=True)
         parquet.write_table(pa.table({"q": [question], "a": [1], **({"more": [1]} if question == "go" else {})}), file)
     (tmp_path / "t.parquet" / "_SUCCESS").touch()
+    (tmp_path / "t.parquet" / "dataset_info.json").write_text("{}")
     (tmp_path / "t.parquet" / ".part-0.parquet.crc").write_bytes(b"x")
     rows = table(tmp_path / "t.parquet", **WIDE, group="split").rows
     assert [(row.task, row.instruction) for row in rows] == [("a/b", "stay"), ("train", "go")]
@@ -256,6 +258,17 @@ def test_template_keys(tmp_path: Path) -> None:
         ("log/x-1", "b"),
         ("log/x-2", "a"),
     ]
+    assert [row.task for row in table(file, **LONG, group="{topic}/{n}").rows] == ["x/1", "x/1", "x/2"]
+
+
+def test_the_next_command_is_one_that_works(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    csv(tmp_path, "q,a,b,t\nwhere is it,1,0,2\nwho was there,0,1,3\n")
+    words = ["--files", str(tmp_path / "t.csv"), "--text", "q", "--policies", "a", "b", "--success", "{policy}", "--out", str(tmp_path / "my log")]
+    assert ingest_main(words) == 0
+    assert f"python -m osel_sim.replay '{tmp_path}/my log' --alpha-time 0 --alpha-price 0 replays it" in capsys.readouterr().out
+    words[-1] = str(tmp_path / "log")
+    assert ingest_main([*words, "--seconds", "t", "--preset", "mmlu"]) == 0
+    assert f"python -m osel_sim.replay {tmp_path}/log --preset mmlu --alpha-price 0 replays it" in capsys.readouterr().out
 
 
 def test_files_whose_unused_columns_differ_and_an_index_without_a_name(tmp_path: Path) -> None:

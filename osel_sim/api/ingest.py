@@ -56,7 +56,7 @@ class IngestConfig(TrustSettings):
     image: Annotated[Names | None, COLUMNS] = None
     """columns with paths of images, relative to the table"""
     group: Annotated[str | None, COLUMNS] = None
-    """what the log calls the task, such as a question's subject"""
+    """what the log calls the task, such as a question's subject: a column, or a template"""
     key: Annotated[str | None, COLUMNS] = None
     """identifies an instance: a column, or a template (default: its text, images and group)"""
     policies: Annotated[Names | None, COLUMNS] = None

@@ -177,7 +177,7 @@ class Columns:
         name: of the workload; the task of instances without a group.
         text: template of the instruction or question: columns in braces.
         images: columns with paths of images, relative to the table that names them.
-        group: column whose value is the log's task, or None.
+        group: template of the log's task, or None.
         key: template of what identifies an instance, or None: its text, images and group do.
         labels: log column (`split`, `phrasing`, `target`, `container`) -> the table's column.
         duplicates: what to do with a second row of the same instance (and policy, and repeat).
@@ -217,8 +217,8 @@ class Columns:
         needed |= {name: "instance.images" for name in self.images}
         needed |= {column: f"instance.{label}" for label, column in self.labels.items()}
         needed |= {name: "instance.key" for name in FIELD.findall(self.key or "")}
+        needed |= {name: "instance.group" for name in FIELD.findall(self.group or "")}
         for key, column in (
-            ("instance.group", self.group),
             ("outcome.policy", self.policy),
             ("outcome.repeat", self.repeat),
             ("outcome.propensity", self.propensity),

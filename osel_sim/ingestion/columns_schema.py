@@ -90,8 +90,8 @@ class InstanceTable:
     """The instruction or question: a column, or a template with columns in braces."""
     images: Annotated[Texts, BeforeValidator(lambda value: [value] if isinstance(value, str) else value, json_schema_input_type=str | Texts)] = ()
     """Columns with paths of images, relative to the table that names them."""
-    group: str | None = None
-    """Column whose value is the log's task."""
+    group: Annotated[str, AfterValidator(_template)] | None = None
+    """What the log calls the task: a column, or a template."""
     key: Annotated[str, AfterValidator(_template)] | None = None
     """What identifies an instance: a column, or a template such as `{subject}-{number}`; left out: its text, images and group do."""
     split: str | None = None

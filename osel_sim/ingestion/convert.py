@@ -123,7 +123,7 @@ def _source(
     columns: Columns, record: Record, sources: dict[str, Source], keys: dict[tuple[Any, ...], str], counters: dict[str, int]
 ) -> tuple[Source, bool]:
     """The instance of a row, and whether an earlier row had it."""
-    task = text(record, columns.group) if columns.group else columns.name
+    task = fill(columns.group, lambda column: text(record, column)) if columns.group else columns.name
     words = fill(columns.text, lambda column: text(record, column))
     images = tuple(_image(record, column) for column in columns.images)
     identity = (task, fill(columns.key, lambda column: text(record, column))) if columns.key else (task, words, images)

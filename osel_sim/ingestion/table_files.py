@@ -17,7 +17,8 @@ SUFFIXES = (*DELIMITERS, ".jsonl", ".ndjson", ".json", *PARQUET)
 def find_files(base: Path, patterns: Sequence[str]) -> list[tuple[Path, dict[str, str]]]:
     """Files of the patterns, each once and in order, with what `{name}` stands for in each; `*` and `?` stand for any characters.
 
-    A folder stands for the files in it, parts of one table as Spark, Dask and pandas write them; a folder `name=value` in it makes a column.
+    A folder stands for the files in it, parts of one table as Spark, Dask and pandas write them; a folder `name=value` in it makes a column. Where
+    there are Parquet files, they are the parts, and others tell something about them.
 
     Raises:
         DataError: a pattern has no file, or a file's format is not known.
@@ -52,18 +53,23 @@ def _matches(folder: Path, part: str, captured: dict[str, str]) -> Iterator[tupl
             yield item, {**captured, **match.groupdict()}
 
 
-def _parts(path: Path, captured: dict[str, str]) -> Iterator[tuple[Path, dict[str, str]]]:
-    """The file, or those of a folder; what begins with a dot or an underscore says only how the parts were written."""
+def _parts(path: Path, captured: dict[str, str]) -> list[tuple[Path, dict[str, str]]]:
+    """The file, or those of a folder."""
     if path.is_file():
-        yield path, captured
-        return
-    for item in sorted(path.iterdir()) if path.is_dir() else ():
+        return [(path, captured)]
+    found = list(_tables(path, captured)) if path.is_dir() else []
+    return [one for one in found if one[0].suffix.lower() in PARQUET] or found
+
+
+def _tables(folder: Path, captured: dict[str, str]) -> Iterator[tuple[Path, dict[str, str]]]:
+    """Tables in a folder and in those within; what begins with a dot or an underscore says only how they were written."""
+    for item in sorted(folder.iterdir()):
         if item.name.startswith((".", "_")):
             continue
         if item.is_dir():
             partition = _PARTITION.fullmatch(item.name)
             value = unquote(partition[2]) if partition else ""
             more = {partition[1]: "" if value == "__HIVE_DEFAULT_PARTITION__" else value} if partition else {}
-            yield from _parts(item, {**captured, **more})
+            yield from _tables(item, {**captured, **more})
         elif item.suffix.lower() in SUFFIXES:
             yield item, captured
