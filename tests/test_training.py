@@ -260,7 +260,6 @@ def test_measuring_the_speed_changes_nothing_that_is_trained(tmp_path: Path) -> 
     assert all(torch.equal(value, before[name]) for name, value in module.state_dict().items()) and not optimiser.state
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("where", ["loss", "gradient"])
 def test_a_training_that_diverges_stops_with_the_last_good_weights(tmp_path: Path, where: str) -> None:
     module = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.BatchNorm1d(2))
@@ -292,6 +291,7 @@ def test_a_policy_that_diverges_keeps_a_checkpoint_and_fails(tmp_path: Path, dem
     assert all(torch.isfinite(value).all() for value in weights.values())
 
 
+@pytest.mark.slow
 def test_a_killed_run_continues(tmp_path: Path, demonstrations: Path) -> None:
     command = [sys.executable, "-m", "osel_sim.train", "--policy", "local_small", "--data", str(demonstrations), "--out", str(tmp_path / "out")]
     command += ["--steps", "12", "--batch-size", "4", "--save-every", "1", "--eval-every", "12", "--threads", "1"]
