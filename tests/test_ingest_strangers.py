@@ -116,6 +116,7 @@ def test_a_folder_of_parts_is_a_table(tmp_path: Path) -> None:
         file = tmp_path / "t.parquet" / f"{part}.parquet"
         file.parent.mkdir(parents=True)
         parquet.write_table(pa.table({"q": [question], "a": [1], **({"more": [1]} if question == "go" else {})}), file)
+    parquet.write_table(pa.table({"q": pa.array([], pa.string()), "a": pa.array([], pa.int64())}), tmp_path / "t.parquet" / "part-2.parquet")
     (tmp_path / "t.parquet" / "_SUCCESS").touch()
     (tmp_path / "t.parquet" / "dataset_info.json").write_text("{}")
     (tmp_path / "t.parquet" / ".part-0.parquet.crc").write_bytes(b"x")

@@ -83,8 +83,11 @@ def first_columns(base: Path, patterns: Sequence[str]) -> list[str]:
 def _read_all(base: Path, patterns: Sequence[str], wanted: Collection[str]) -> Table:
     records: list[Record] = []
     parts: list[tuple[Path, list[str], set[str]]] = []
-    for file, captured in find_files(base, patterns):
+    files = find_files(base, patterns)
+    for file, captured in files:
         columns, rows = _read(file, wanted)
+        if not rows:
+            continue  # writers of parts leave empty ones
         clash = captured.keys() & set(columns)
         if clash:
             raise DataError(
@@ -93,6 +96,8 @@ def _read_all(base: Path, patterns: Sequence[str], wanted: Collection[str]) -> T
         told = {name: cell(value) for name, value in captured.items() if name in wanted}
         parts.append((file, [*columns, *captured], {*rows[0].values, *told}))
         records += [Record(row.file, row.number, row.line, {**row.values, **told}) for row in rows]
+    if not records:
+        raise DataError(f"{files[0][0]}: has no rows" + (f", nor have {len(files) - 1} other files" if len(files) > 1 else ""))
     there = set().union(*(part[2] for part in parts))
     for file, columns, own in parts:
         lacking = there - own
@@ -106,7 +111,7 @@ def _read_all(base: Path, patterns: Sequence[str], wanted: Collection[str]) -> T
 
 
 def _read(file: Path, wanted: Collection[str]) -> tuple[list[str], list[Record]]:
-    """Columns and rows of one file, at least one row."""
+    """Columns and rows of one file."""
     suffix = file.suffix.lower()
     try:
         if suffix in PARQUET:
@@ -119,8 +124,6 @@ def _read(file: Path, wanted: Collection[str]) -> tuple[list[str], list[Record]]
         raise DataError(f"{file}: is not UTF-8 text ({error.reason} at byte {error.start})") from None
     except OSError as error:
         raise DataError(f"{file}: cannot be read ({error.strerror or error})") from None
-    if not rows:
-        raise DataError(f"{file}: has no rows")
     return columns, rows
 
 
