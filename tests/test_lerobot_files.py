@@ -17,7 +17,7 @@ from osel_sim.core.errors import ContentError, DataError
 from osel_sim.formats import library
 from osel_sim.formats.dataset_mapping import DatasetMapping, load_dataset_mapping
 from osel_sim.ingestion.action_mse import Measurement, open_datasets
-from osel_sim.ingestion.lerobot_files import open_dataset
+from osel_sim.ingestion.lerobot_check import open_dataset
 from osel_sim.ingestion.lerobot_numbers import actions, check_mapping, states
 from osel_sim.training.dataset import load_demonstrations
 

@@ -21,7 +21,7 @@ from osel_sim.episodes.loop import Driver, episode_seed
 from osel_sim.formats.dataset_mapping import IMAGES, STATE, DatasetMapping
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
-from osel_sim.ingestion.lerobot_files import open_dataset
+from osel_sim.ingestion.lerobot_check import open_dataset
 from osel_sim.ingestion.lerobot_numbers import actions, check_mapping, states
 from osel_sim.ingestion.write import IngestedInstance
 from osel_sim.interface.encoder import Image

@@ -20,7 +20,8 @@ from osel_sim.core.files import atomic, content_digest, is_partial, read_json
 from osel_sim.core.parquet import PARQUET_ERRORS, unreadable
 from osel_sim.core.progress import progress as progress_bar
 from osel_sim.formats.dataset_mapping import DatasetMapping
-from osel_sim.ingestion.lerobot_files import INFO, DatasetFiles, open_dataset
+from osel_sim.ingestion.lerobot_check import INFO, open_dataset
+from osel_sim.ingestion.lerobot_files import DatasetFiles
 from osel_sim.ingestion.lerobot_numbers import actions, states
 from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations
 
