@@ -127,6 +127,18 @@ def test_a_folder_of_parts_is_a_table(tmp_path: Path) -> None:
         table(tmp_path / "empty", **WIDE)
 
 
+def test_damaged_pages_and_odd_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "12:30"
+    folder.mkdir()
+    file = folder / "t.parquet"
+    parquet.write_table(pa.table({"q": ["go", "stay"], "a": [1, 0]}), file, compression="none", write_page_checksum=True)
+    monkeypatch.chdir(tmp_path)
+    assert len(table(Path("12:30/t.parquet"), **WIDE).rows) == 2
+    file.write_bytes(file.read_bytes().replace(b"stay", b"sway", 1))
+    with pytest.raises(DataError, match="is not a whole Parquet file"):
+        table(Path("12:30/t.parquet"), **WIDE)
+
+
 @pytest.mark.parametrize("blank", ["", "   ", "\t", "\u00a0", "\u200b", " \ufeff "])
 def test_blanks_are_empty(blank: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"row 1 .line 2., column 'q': is empty, expected text"):

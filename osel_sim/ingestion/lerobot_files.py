@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError, did_you_mean
 from osel_sim.core.images import load_image
-from osel_sim.core.parquet import PARQUET_ERRORS, read_parquet, unreadable
+from osel_sim.core.parquet import PARQUET_ERRORS, open_parquet, read_parquet, unreadable
 
 EPISODES = "meta/episodes"
 VIDEO = "videos/{column}/chunk-{chunk:03d}/file-{file:03d}.mp4"
@@ -128,12 +128,10 @@ class DatasetFiles:
         return load_image(file, where)
 
     def _cell(self, file: Path, column: str, row: int) -> Any:
-        import pyarrow.parquet
-
         place, first, cells = self._read.get(column, (None, 0, ()))
         if place != file or not first <= row < first + len(cells):
             try:
-                content = pyarrow.parquet.ParquetFile(file)
+                content = open_parquet(file)
                 sizes = [content.metadata.row_group(index).num_rows for index in range(content.num_row_groups)]
                 edges = np.cumsum([0, *sizes])
                 group = int(np.searchsorted(edges, row, side="right")) - 1

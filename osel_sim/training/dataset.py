@@ -12,12 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as parquet
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic, content_digest, is_partial, read_json
-from osel_sim.core.parquet import PARQUET_ERRORS, unreadable
+from osel_sim.core.parquet import PARQUET_ERRORS, open_parquet, unreadable
 from osel_sim.core.progress import progress as progress_bar
 from osel_sim.formats.dataset_mapping import DatasetMapping
 from osel_sim.ingestion.lerobot_check import INFO, open_dataset
@@ -161,7 +160,7 @@ def _decode(files: DatasetFiles, column: str, out: NDArray[np.uint8], label: str
 
 def _batches(file: Path, column: str) -> Iterator[list[Any]]:
     try:
-        for batch in parquet.ParquetFile(file).iter_batches(batch_size=DECODE_ROWS, columns=[column]):
+        for batch in open_parquet(file).iter_batches(batch_size=DECODE_ROWS, columns=[column]):
             yield batch.column(0).to_pylist()
     except PARQUET_ERRORS as error:
         raise unreadable(file, error) from None
