@@ -16,8 +16,10 @@ from osel_sim.__main__ import COMMANDS
 from osel_sim.api.run import RunConfig
 from osel_sim.cli.command import Command, read_settings
 from osel_sim.core import content
+from osel_sim.formats.dataset_mapping import load_dataset_mapping
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.formats.task_file import load_task_file
+from osel_sim.ingestion.columns_file import load_columns
 from osel_sim.policy.registry import kinds
 from osel_sim.selection.registry import selector_locations
 from osel_sim.suites.registry import select_tasks
@@ -92,6 +94,10 @@ def test_toml_blocks_are_valid_files(block: Block, tmp_path: Path) -> None:
         load_task_file(file)
     elif "kind" in data:
         assert load_policy_file(file).kind in kinds()
+    elif "table" in data:
+        load_columns(file)
+    elif "columns" in data:
+        load_dataset_mapping(file)
     else:
         RunConfig.of(**read_settings(file, RunConfig))
 

@@ -1,12 +1,17 @@
 """The report as files: one page, figures as PNG and SVG, tables as CSV; words from logs stay words."""
 
 import base64
+import contextlib
 import csv
 import io
 import json
+import logging
+import os
 import re
 import shutil
+import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from urllib.parse import unquote
 
@@ -20,7 +25,9 @@ from synthetic_log import make_row, write_log
 
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.log import read_log
-from osel_sim.core.errors import UsageError
+from osel_sim.api.report import report
+from osel_sim.cli.output import show_log
+from osel_sim.core.errors import DataError, UsageError
 from osel_sim.episodes.tensorboard import check_installed
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.report import main as report_main
@@ -193,6 +200,45 @@ def test_page_of_a_run_that_knows_only_what_was_chosen(tmp_path):
     page = (folder / "report.html").read_text()
     assert "run with --counterfactual to compare" in page
     assert "regret" not in embedded(page)["figures"]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("case", ["one decision", "one policy chosen", "one policy always fails", "a log with a policy that always fails"])
+def test_what_is_not_known_is_no_warning(case, tmp_path):
+    if case.startswith("a log"):
+        rows = [
+            make_row(f"t/test/0/{number}", policy, 0, number % 2 == 0, **({"error": "gone"} if policy == "b" else {}))
+            for number in range(12)
+            for policy in ("a", "b", "c")
+        ]
+        write_log(tmp_path, rows, {row.instance: np.arange(4.0) + len(row.instance) for row in rows})
+        with contextlib.suppress(DataError):  # no instance has an outcome of every policy
+            report(tmp_path, alpha_time=0, alpha_price=0)
+        return
+    made_run(tmp_path, decisions=1 if case == "one decision" else 12, counterfactual=case == "one policy always fails")
+    file = tmp_path / "episodes.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    kept = [line for line in lines if case != "one policy chosen" or line["policy"] == NEAR]
+    for index, line in enumerate(kept):
+        line["index"] = index
+        if case == "one policy always fails" and line["policy"] == FAR:
+            line |= {"error": "gone", "success": False, "reward": None}
+    file.write_text("".join(json.dumps(line) + "\n" for line in kept))
+    assert "Mean reward" in report(tmp_path).page.read_text()
+
+
+def test_commands_keep_what_libraries_warn_of_to_themselves(capsys):
+    def noisy():
+        warnings.warn("Mean of empty slice", RuntimeWarning, stacklevel=1)
+        logging.getLogger("library").warning("this may change")
+        return subprocess.run([sys.executable, "-c", "import warnings; warnings.warn('from a child')"], capture_output=True, text=True).stderr
+
+    before = warnings.filters[:]
+    with show_log():
+        assert noisy() == ""
+        logging.getLogger("osel_sim.somewhere").warning("of ours")
+    assert capsys.readouterr().err == "warning: of ours\n"
+    assert warnings.filters == before and "PYTHONWARNINGS" not in os.environ
 
 
 def test_videos_are_put_into_the_page_or_linked_from_it(tmp_path, monkeypatch):

@@ -52,6 +52,8 @@ class TrainConfig(TrustSettings):
     """save the state for --resume every so many steps"""
     half: Annotated[bool, OTHER] = False
     """save the weights in half precision"""
+    map: Annotated[Path | None, CONTENT] = None
+    """file that says which names and conventions of the datasets are others than ours"""
     recipe: Annotated[Path | None, CONTENT] = None
     """file with sizes and settings (default: policies/training/NAME.toml)"""
     policies_dir: Annotated[Path | None, CONTENT] = None
@@ -136,6 +138,7 @@ def train(config: TrainConfig | None = None, /, **values: Any) -> tuple[Path, di
         half=config.half,
         tasks=config.tasks,
         init=config.init,
+        mapping=config.map,
     )
     with trusting(config.trust):
         return out, policy_training.train(spec, recipe, config.data, options)

@@ -30,6 +30,8 @@ SCHEMA_VERSION = 3
 _COLUMNS_ADDED = {2: ("score", "axes"), 3: ("robot",)}
 """Columns that came with a version; logs of an earlier one are read without them."""
 ROLLOUTS = "rollouts.parquet"
+PROPENSITIES = "propensities"
+"""Key in a log's metadata: with which probability the policy of each row was chosen, where the log is of decisions (logged bandit data)."""
 DECLARED = "skills"
 """Key of the metadata that says what policies declare: policy -> names of skills. Examples of them lie among the contexts."""
 _PREFIX, _CHECKSUM = b"osel_sim.", "checksum"

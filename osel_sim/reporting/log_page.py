@@ -4,13 +4,16 @@ from collections.abc import Sequence
 
 from osel_sim.analysis.clusters import complete_rows
 from osel_sim.analysis.estimate import Estimate
+from osel_sim.analysis.evaluation import evaluate
 from osel_sim.analysis.log import LoggedOutcomes
+from osel_sim.analysis.logged_choices import choices_of, has_choices
 from osel_sim.analysis.outcomes import overall, remote_policies
 from osel_sim.core.errors import DataError
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, cluster_blocks, frontier_figure, weights_blocks
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_sections import context_figure, formula, policy_blocks, rates_table, time_figure
+from osel_sim.reporting.off_policy_section import off_policy_table, off_policy_verdict
 from osel_sim.reporting.page import Block, Page, Section, Tile, Verdict
 from osel_sim.reporting.routes import route_figure
 from osel_sim.selection.reward import RewardWeights
@@ -26,10 +29,13 @@ def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_sc
         DataError: the log lacks what the weights ask for.
     """
     sections, routing = log_sections(log, weights)
+    found = evaluate(choices_of(log), weights) if has_choices(log) else None
+    if found is not None:
+        sections.insert(0, Section("off_policy", "Other ways of choosing", [off_policy_table(found)]))
     title = f"{few(sorted(set(log.labels('task'))))}: {len(log):,} instances, {len(log.policies)} policies"
     rows, _ = read_rollouts(log.source)
     episodes = list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes(log))
-    verdict = _verdict(log, weights, routing)
+    verdict = off_policy_verdict(found) if found is not None else _verdict(log, weights, routing)
     return Page("Rollout log", title, verdict, sections, log_facts(log, weights), episodes, route_figure(log, weights))
 
 

@@ -1,4 +1,4 @@
-"""Off-policy estimates of a live run as a table."""
+"""Off-policy estimates of decisions that were made, as a table and in a sentence."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 from osel_sim.analysis.estimate import Estimate
 from osel_sim.analysis.off_policy import LEAST_EFFECTIVE, WAYS
 from osel_sim.reporting.html_tables import Cell, Column, Table
+from osel_sim.reporting.page import Tile, Verdict
 
 
 def off_policy_table(found: Mapping[str, Any]) -> Table:
@@ -34,6 +35,24 @@ def off_policy_table(found: Mapping[str, Any]) -> Table:
         "Greedy: the policy of the highest reward by a linear model of earlier decisions. A dash: too few, or the run could never have chosen so."
     )
     return Table("off_policy", "What other ways of choosing would have earned", caption, columns, rows)
+
+
+def off_policy_verdict(found: Mapping[str, Any]) -> Verdict:
+    """What a page of logged decisions says first: what was earned, and what the best single policy is estimated to earn (doubly robust)."""
+    run, targets = found["run"], found["targets"]
+    earned = f"{run['mean_reward']:.3f} a decision was earned by {run['selector']}, in {run['decisions']} decisions"
+    known = {name: entry for name, entry in targets.items() if name.startswith("fixed:") and entry["dr"] is not None}
+    if not known:
+        return Verdict("What was chosen is all that is known", [f"{earned}. No other way of choosing can be estimated from it."])
+    name = max(known, key=lambda target: known[target]["dr"])
+    policy, value, ends = name.removeprefix("fixed:"), known[name]["dr"], known[name]["dr_ci95"]
+    between = "" if ends is None else f", between {ends[0]:.3f} and {ends[1]:.3f}"
+    tiles = [Tile("earned", f"{run['mean_reward']:.3f}", "mean reward a decision"), Tile(f"always {policy}", f"{value:.3f}", "estimated")]
+    return Verdict(
+        f"Always {policy} is estimated to earn {value:.3f}",
+        [f"{earned}; always {policy} is estimated to earn {value:.3f}{between} (95%), the most of any single policy."],
+        tiles,
+    )
 
 
 def _estimate(entry: Mapping[str, Any], key: str, interval: str) -> Estimate | float | None:

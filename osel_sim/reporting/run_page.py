@@ -179,7 +179,8 @@ def _verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
         sentence = "What the other policies would have done is not known: run with --counterfactual to compare."
         return Verdict(f"{selector} received {reward.value:.3f} a decision" if reward else f"{selector} received nothing", [sentence], tiles)
     fixed = {name: stream for name, stream in streams.items() if name.startswith("always ")}
-    best = max(fixed, key=lambda name: float(np.nanmean(fixed[name].reward)))
+    known = {name: stream.reward[np.isfinite(stream.reward)] for name, stream in fixed.items()}
+    best = max(fixed, key=lambda name: float(known[name].mean()) if known[name].size else -np.inf)
     differences = own.reward - fixed[best].reward
     differences = differences[np.isfinite(differences)]
     if not differences.size:
