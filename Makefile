@@ -78,6 +78,7 @@ $(READY): requirements.txt pyproject.toml
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check "$$(grep '^uv==' requirements.txt)"
 	.venv/bin/uv pip install --quiet --compile-bytecode --python $(PYTHON) --no-deps -r requirements.txt
 	.venv/bin/uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
+	$(PYTHON) -m osel_sim.cli.prepare
 	@touch $@
 
 clean:

@@ -27,9 +27,11 @@ what each fixed policy, random choice and a linear model would have earned (off_
 
 def _execute(config: ReplayConfig) -> int:
     from osel_sim.api.replay import replay
+    from osel_sim.cli.next_step import print_next
 
     result = replay(config, on_result=_print)
-    print(f"written to {result.folder}; python -m osel_sim.report {result.folder} makes a page of it")
+    print(f"written to {result.folder}")
+    print_next(("makes a page of it", "report", [result.folder, "--open"]))
     return 0
 
 

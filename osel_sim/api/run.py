@@ -168,13 +168,15 @@ class _Run:
     def execute(self) -> RunResult:
         """Do it."""
         from osel_sim.context.encoder import load_encoder
-        from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+        from osel_sim.context.names import DEFAULT_ENCODER
         from osel_sim.formats.run_config import check_run_folder, start_or_resume
+        from osel_sim.remote.policy import check_servers
         from osel_sim.suites.ran_with import ran_with
 
         config, folder = self.config, self.config.folder
         configuration = self._configuration()
         check_run_folder(folder, configuration, config.resume)
+        check_servers(self.everyone, self.environment)
         encoder = load_encoder(config.encoder or DEFAULT_ENCODER)
         configuration["encoder"] = encoder.identity
         seen = self._log(config.warm_start, encoder.identity) if config.warm_start else None

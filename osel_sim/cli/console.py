@@ -9,6 +9,7 @@ from rich.segment import Segment
 from rich.table import Table
 
 from osel_sim.core.shown import shown
+from osel_sim.selection.registry import RECOMMENDATION, is_recommended
 
 
 class SafeConsole(Console):
@@ -39,7 +40,8 @@ def percent(rate: float | None, interval: tuple[float, float] | list[float] | No
 
 def run_table(summary: dict[str, Any]) -> Table:
     """The selector, each policy where it was chosen, and with a counterfactual what could have been."""
-    table = Table(title=f"{summary['task']}: {summary['decisions']} decisions", title_justify="left")
+    hint = None if is_recommended(summary["selector"]) else f"{RECOMMENDATION}."
+    table = Table(title=f"{summary['task']}: {summary['decisions']} decisions", title_justify="left", caption=hint, caption_justify="left")
     table.add_column("")
     for heading in ("decisions", "mean reward", "success [95%]", "steps", "seconds", "price (cents)", "fallbacks", "errors"):
         table.add_column(heading, justify="right")
