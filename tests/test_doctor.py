@@ -8,8 +8,8 @@ import pytest
 from safetensors.numpy import save_file
 
 from osel_sim.cli import machine_checks
+from osel_sim.cli.machine_checks import Check
 from osel_sim.core import content
-from osel_sim.doctor import Check
 
 
 def checkpoint(folder: Path) -> Path:
