@@ -58,7 +58,8 @@ def _execute(config: DoctorConfig) -> int:
     if config.json:
         print(json.dumps({"ready": ready, "checks": [asdict(check) for check in checks]}, indent=2))
     else:
-        print_checks(checks, ready)
+        folders = (("--tasks", config.tasks), ("--policies-dir", config.policies_dir))
+        print_checks(checks, ready, [word for flag, folder in folders if folder for word in (flag, folder)])
     return 0 if ready else 1
 
 

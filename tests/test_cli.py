@@ -210,4 +210,9 @@ def test_a_list_names_tasks_and_policies() -> None:
     listed = json.loads(data)
     assert "pick_place" in [task["name"] for task in listed["tasks"]]
     assert {"Panda", "UR5e", "Kinova3"} <= {robot["name"] for robot in listed["robots"]}
+    assert {"auto", "ppo", "thompson"} <= {selector["name"] for selector in listed["selectors"]}
+    assert {"osel_small", "osel_suite", "MODEL:TAG"} <= {encoder["name"] for encoder in listed["encoders"]}
+    assert {"mmlu", "oxe"} <= {preset["name"] for preset in listed["presets"]}
+    for words in ("one we recommend", "sentence:MODEL", "0.0008 cents", "(default)", "next: "):
+        assert words in table
     assert {"local_small": "local", "remote_large": "remote"}.items() <= {policy["name"]: policy["location"] for policy in listed["policies"]}.items()

@@ -92,4 +92,6 @@ def test_the_table_says_what_to_do(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1
     assert "correct mine.toml" in done.stdout
-    assert "missing" in done.stdout.splitlines()[-1]
+    *_, summary, following = done.stdout.splitlines()
+    assert "missing" in summary
+    assert f"-m osel_sim.doctor --policies-dir {tmp_path} " in following
