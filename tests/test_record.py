@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from remote_helpers import alive
-from run_helpers import HORIZON, children, command, environment, execute, make_world, wait_for_lines, wait_until
+from run_helpers import HORIZON, children, command, environment, execute, make_world, next_commands, wait_for_lines, wait_until
 
 from osel_sim.analysis.log import read_log
 from osel_sim.context.cache import ContextCache
@@ -78,6 +78,8 @@ def test_every_policy_on_every_instance_from_the_same_state(reference):
     assert len(np.unique(contexts, axis=0)) == INSTANCES
     assert sorted(file.name for file in folder.iterdir()) == ["contexts.npz", "rollouts.parquet", "run.json"]
     assert "episodes an hour" in done.stdout
+    assert f"written to {folder}" in done.stdout
+    assert [name for name, _ in next_commands(done.stdout)] == ["replay", "report", "record"]
     assert "success [95%]" in done.stdout
 
 

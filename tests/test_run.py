@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
+from remote_helpers import alive
+from run_helpers import HORIZON, children, command, environment, execute, make_world, next_commands, wait_for_lines, wait_until
 from synthetic_log import make_row, write_log
 
 from osel_sim.analysis.live import read_live
 from osel_sim.formats.journal import read_journal
+from osel_sim.reporting.run_page import run_page
 from osel_sim.run import main as run_main
 from osel_sim.selection.state import load_state
 
@@ -50,6 +52,8 @@ def test_what_a_run_writes_and_prints(world, reference):
     assert sorted(file.name for file in folder.iterdir()) == sorted(f"{files} {page}".split())
     assert "mean reward" in done.stdout
     assert "hindsight oracle" in done.stdout
+    assert "--selector auto" in done.stdout
+    assert [name for name, _ in next_commands(done.stdout)] == ["report", "replay", "run"]
     assert "Traceback" not in done.stderr
     decisions = read_journal(folder / "episodes.jsonl")
     assert [decision.seed for decision in decisions] == list(range(EPISODES))
@@ -96,15 +100,18 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
     folder = world / f"killed-{trial}"
     arguments = ["--episodes", EPISODES, "--counterfactual", "--out", folder]
     for attempt in range(1 + trial):
-        flags = [*(["--resume"] if attempt else []), *(["--video", "2"] if attempt == 0 else [])]
+        flags = [*(["--resume"] if attempt else []), *(["--video", "2", "--view"] if attempt == 0 else [])]
         process = subprocess.Popen(
             command(world, "run", *arguments, *flags), env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         )
         wait_for_lines(process, folder / "episodes.jsonl", 1 + attempt + chance.randrange(3 - trial))
         time.sleep(chance.random() * 0.15)  # about a decision: somewhere in the next one
+        started = children(process)
         process.send_signal(signal.SIGKILL)
         process.wait()
         process.stderr.close()
+        assert wait_until(lambda started=started: not any(map(alive, started)), 20)  # what shows the run among them
+    assert run_page(folder).title.endswith(f" over {len(read_journal(folder / 'episodes.jsonl'))} decisions")
     assert len(read_journal(folder / "episodes.jsonl")) < EPISODES
     done = execute(world, "run", *arguments, "--resume")
     assert done.returncode == 0, done.stderr

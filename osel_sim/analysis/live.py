@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.log import Array, LoggedInstance, LoggedOutcomes, dense, named_robots, read_contexts
+from osel_sim.context.cache import FILE, ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
 from osel_sim.formats.journal import Decision, read_journal, read_lines
@@ -17,7 +18,7 @@ from osel_sim.formats.run_config import RUN
 from osel_sim.interface.outcome import Outcome, Seconds
 from osel_sim.selection.reward import RewardWeights
 
-JOURNAL, COUNTERFACTUAL = "episodes.jsonl", "counterfactual.jsonl"
+JOURNAL, COUNTERFACTUAL, SUMMARY = "episodes.jsonl", "counterfactual.jsonl", "summary.json"
 
 ABOUT = ("task", "seed", "level", "axes", "split", "instruction", "phrasing", "target", "container", "robot")
 """What a decision says of its instance."""
@@ -33,6 +34,7 @@ class LiveLog:
         propensities: (T, P) with which each policy would have been chosen.
         selector: name of the selector that chose.
         reward: weights that the run was made with, as `RewardWeights` takes them.
+        decisions: the journal's, T of them.
     """
 
     outcomes: LoggedOutcomes
@@ -40,6 +42,7 @@ class LiveLog:
     propensities: Array
     selector: str
     reward: dict[str, Any]
+    decisions: tuple[Decision, ...]
 
     def has_all_outcomes(self, weights: RewardWeights) -> bool:
         """Whether some decision has the outcome of every policy, so that selectors can be replayed on it."""
@@ -64,7 +67,7 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     policies = configuration.get("policies")
     if not isinstance(policies, list) or not policies or not all(isinstance(name, str) for name in policies):
         raise DataError(f"{folder / RUN}: configuration.policies must name the policies, got {policies!r}")
-    decisions = read_journal(folder / JOURNAL)
+    decisions = _as_far_as_contexts(folder, read_journal(folder / JOURNAL), encoder or configuration.get("encoder"))
     if not decisions:
         raise DataError(f"{folder / JOURNAL}: the run made no decision")
     for decision in decisions:
@@ -83,7 +86,20 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     outcomes = LoggedOutcomes(folder, instances, tuple(policies), contexts, identity, **arrays, errors=errors, metadata=configuration, skills=None)
     propensities = np.array([[decision.propensities.get(policy, 0.0) for policy in policies] for decision in decisions], np.float64)
     chosen = np.array([policies.index(decision.policy) for decision in decisions], np.int64)
-    return LiveLog(outcomes, chosen, propensities, str(configuration.get("selector", "unknown")), dict(configuration.get("reward", {})))
+    return LiveLog(
+        outcomes, chosen, propensities, str(configuration.get("selector", "unknown")), dict(configuration.get("reward", {})), tuple(decisions)
+    )
+
+
+def _as_far_as_contexts(folder: Path, decisions: list[Decision], encoder: str | None) -> list[Decision]:
+    """The decisions without the last few that have no context yet, in a run that goes on or was killed: contexts are written some at a time."""
+    if encoder is None or not (folder / FILE).is_file():
+        return decisions
+    cache = ContextCache(folder)
+    have = [cache.get(encoder, _key(decision)) is not None for decision in decisions]
+    known = sum(have)
+    finished = read_json(folder / SUMMARY).get("decisions", 0) if (folder / SUMMARY).is_file() else 0
+    return decisions[:known] if all(have[:known]) and known > 0 and known >= finished else decisions
 
 
 def _key(decision: Decision) -> str:

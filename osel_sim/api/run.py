@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+FILMED_EVERY = 5
+"""Of a run that is viewed, one in so many decisions is filmed."""
+
 
 @settings
 class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
@@ -67,6 +70,8 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """run the other policies as well, from the same state, to compare (nothing is learnt from them)"""
     video: Annotated[Index, OUTPUT] = 0
     """film so many decisions, spread evenly over the run"""
+    view: Annotated[bool, OUTPUT] = False
+    """show the run in the browser while it goes on: a page on this machine that grows every few decisions, with the last film"""
     tensorboard: Annotated[bool, OUTPUT] = False
     """also write TensorBoard event files (needs the package tensorboard)"""
     realtime: Annotated[bool, OTHER] = False
@@ -83,7 +88,9 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
 
     @property
     def filmed(self) -> frozenset[int]:
-        """Indices of the decisions to film: the first, the last, and evenly between."""
+        """Indices of the decisions to film: the first, the last, and evenly between; with `view` every few, unless it is said how many."""
+        if self.view and not self.video:
+            return frozenset(range(0, self.episodes, FILMED_EVERY))
         count = min(self.video, self.episodes)
         if count == 1:
             return frozenset({0})
@@ -274,10 +281,11 @@ class _Run:
         from osel_sim.episodes.progress import Progress
         from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
         from osel_sim.episodes.tensorboard import TensorBoard
+        from osel_sim.reporting.view import View
 
         config = self.config
-        films = [Films(folder, config.filmed)] if config.video else []
-        wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard)) if asked]
+        films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
+        wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
         return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), self.page]
 
     def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:

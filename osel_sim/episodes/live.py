@@ -76,7 +76,8 @@ class LiveRun:
         self.folder, self.tasks, self.encoder = folder, tasks, encoder
         self.drivers, self.selector, self.options = drivers, selector, options
         self.subscribers = subscribers
-        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder)
+        # Contexts are on disk about as soon as their decisions: a run that goes on, or was killed, can be reported on.
+        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder, autosave=1)
         self._journal = Lines(folder / JOURNAL)
         self.decisions = [to_decision(data, index, self._journal.file) for index, (data, _) in enumerate(self._journal.rows)]
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None

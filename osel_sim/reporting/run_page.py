@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from osel_sim.analysis.clusters import score_of
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.evaluation import evaluate
-from osel_sim.analysis.live import JOURNAL, LiveLog, read_live
+from osel_sim.analysis.live import LiveLog, read_live
 from osel_sim.analysis.log import Array, LoggedOutcomes
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
-from osel_sim.formats.journal import Decision, read_journal
+from osel_sim.formats.journal import Decision
 from osel_sim.formats.run_config import RUN
 from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, thinned
@@ -110,7 +110,7 @@ def _read(folder: Path) -> _Run:
         weights = RewardWeights(**live.reward)
     except TypeError as error:
         raise DataError(f"{folder / RUN}: configuration.reward does not have the promised form ({error})") from None
-    return _Run(folder, live, read_journal(folder / JOURNAL), weights)
+    return _Run(folder, live, live.decisions, weights)
 
 
 def _streams(run: _Run, selector: str) -> dict[str, Stream]:
