@@ -15,6 +15,7 @@ from remote_helpers import alive
 from run_helpers import HORIZON, children, command, environment, execute, make_world, next_commands, wait_for_lines, wait_until
 
 from osel_sim.analysis.log import read_log
+from osel_sim.api.report import report
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.files import digest
 from osel_sim.episodes.workers import Plan
@@ -94,6 +95,9 @@ def test_one_worker_killed_with_its_parent_and_resumed_by_two_writes_the_same_by
     process.wait()
     process.stderr.close()
     assert not (folder / "rollouts.parquet").exists()
+    before = (folder / "shards.jsonl").read_bytes()
+    report(folder, out=world / "page")  # as far as it is, and without touching it
+    assert (world / "page" / "report.html").is_file() and (folder / "shards.jsonl").read_bytes() == before
     done = execute(world, "record", *arguments, "--workers", 2, "--resume")
     assert done.returncode == 0, done.stderr
     assert files(folder) == files(reference[0])

@@ -1,6 +1,7 @@
 """The page of a live run, a replay or a rollout log."""
 
 import contextlib
+import logging
 import os
 import threading
 from collections.abc import Callable
@@ -15,6 +16,8 @@ from osel_sim.core.errors import DataError, SettingError
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.reporting.page import Page
+
+logger = logging.getLogger(__name__)
 
 
 @settings
@@ -122,6 +125,7 @@ def _page(config: ReportConfig) -> "Page":
     from osel_sim.analysis.live import JOURNAL
     from osel_sim.formats.replay_result import REPLAY
     from osel_sim.formats.rollout_log import ROLLOUTS
+    from osel_sim.formats.shards import SHARDS
 
     folder = config.folder
 
@@ -137,6 +141,14 @@ def _page(config: ReportConfig) -> "Page":
         log = read_log(folder, config.encoder)
         weights, _ = weights_of(config, log.metadata)
         return log_page(log, weights, draw)
+    if (folder / SHARDS).is_file():
+        from osel_sim.analysis.log import read_unfinished
+        from osel_sim.reporting.log_page import log_page
+
+        log, rows = read_unfinished(folder)
+        logger.warning("%s: the recording goes on or was interrupted; its page is of the %d instances so far", folder, len(log))
+        weights, _ = weights_of(config, log.metadata)
+        return log_page(log, weights, draw, rows)
     for setting in ("encoder", *FLAGS):
         if getattr(config, setting) is not None:
             raise SettingError(setting, f"{folder} is no rollout log; a run and a replay have what they were made with")

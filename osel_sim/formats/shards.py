@@ -10,10 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError
-from osel_sim.formats.journal import Lines
+from osel_sim.formats.journal import Lines, read_lines
 from osel_sim.formats.rollout_log import Row
 
 SHARDS = "shards.jsonl"
+
+
+Rows = dict[str, dict[tuple[str, int], Row]]
+Contexts = dict[str, dict[str, NDArray[np.float32]]]
+
+
+def read_shards(folder: Path) -> tuple[Rows, Contexts]:
+    """Rows and contexts, as `Shards` has them; nothing is written, so that the folder of a recording that goes on can be read.
+
+    Raises:
+        DataError: naming file and line.
+    """
+    rows: Rows = {}
+    contexts: Contexts = {}
+    for number, (data, _) in enumerate(read_lines(folder / SHARDS), 1):
+        try:
+            key, encoder, context = data["instance"], data["encoder"], data["context"]
+            _put(rows, key, [Row(**row) for row in data["rows"]])
+            if context is not None:
+                contexts.setdefault(encoder, {})[key] = np.frombuffer(base64.b64decode(context), "<f4").astype(np.float32)
+        except (KeyError, TypeError, ValueError) as error:
+            raise DataError(f"{folder / SHARDS}, line {number}: not a recorded instance ({error})") from None
+    return rows, contexts
+
+
+def _put(known: Rows, instance: str, rows: list[Row]) -> None:
+    known.setdefault(instance, {}).update({(row.policy, row.repeat): row for row in rows})
 
 
 class Shards:
@@ -25,28 +52,16 @@ class Shards:
     """
 
     def __init__(self, folder: Path) -> None:
+        self.rows, self.contexts = read_shards(folder)
         self._lines = Lines(folder / SHARDS)
-        self.rows: dict[str, dict[tuple[str, int], Row]] = {}
-        self.contexts: dict[str, dict[str, NDArray[np.float32]]] = {}
-        for number, (data, _) in enumerate(self._lines.rows, 1):
-            try:
-                key, encoder, context = data["instance"], data["encoder"], data["context"]
-                self._put(key, [Row(**row) for row in data["rows"]])
-                if context is not None:
-                    self.contexts.setdefault(encoder, {})[key] = np.frombuffer(base64.b64decode(context), "<f4").astype(np.float32)
-            except (KeyError, TypeError, ValueError) as error:
-                raise DataError(f"{self._lines.file}, line {number}: not a recorded instance ({error})") from None
 
     def add(self, instance: str, rows: list[Row], encoder: str, context: NDArray[np.float32] | None) -> None:
         """Write one instance and wait until it is on disk."""
         encoded = None if context is None else base64.b64encode(context.astype("<f4").tobytes()).decode()
         self._lines.append({"instance": instance, "rows": [vars(row) for row in rows], "encoder": encoder, "context": encoded})
-        self._put(instance, rows)
+        _put(self.rows, instance, rows)
         if context is not None:
             self.contexts.setdefault(encoder, {})[instance] = context
-
-    def _put(self, instance: str, rows: list[Row]) -> None:
-        self.rows.setdefault(instance, {}).update({(row.policy, row.repeat): row for row in rows})
 
     def close(self, remove: bool) -> None:
         """Close the file, and delete it once the rollout log holds everything."""
