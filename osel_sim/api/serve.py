@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UsageError
 from osel_sim.core.trust import trusting
+from osel_sim.remote.address import check_address
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 from osel_sim.remote.serving import run_until_signal, stop_with_stdin
 
@@ -67,6 +68,7 @@ def _serve(config: ServeConfig) -> None:
     if given is None and not is_loopback(config.host):
         raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
+    check_address(config.host, config.port)
     if not config.watch_stdin:  # who starts the server itself knows
         secret = f"the token in {config.token_env}" if given is not None else f"a token that is printed then (none is in {config.token_env})"
         logger.info("loading %s; clients connect to port %s of %s with %s ...", spec.name, config.port or "(a free one)", config.host, secret)
