@@ -45,7 +45,7 @@ def sb3_weights(selector, hidden: str, output: str) -> np.ndarray:
 
 
 CASES = {
-    "paper": ("ppo", 64, 60, {}),
+    "paper": ("ppo", 64, 40, {}),
     "paper, no limit on the divergence": ("ppo", 16, 60, {"target_kl": None, "layers": (32, 16)}),
     "unclipped gradients": ("ppo", 16, 60, {"max_grad_norm": 1e9, "layers": (32,), "ent_coef": 0.2}),
     "rollouts that are no multiple of five": ("ppo", 16, 100, {"n_steps": 13, "batch_size": 13, "layers": (32, 16), "learning_rate": 3e-3}),

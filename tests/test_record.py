@@ -48,10 +48,14 @@ def files(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in ("rollouts.parquet", "contexts.npz")}
 
 
+def resumed(world: Path, folder: Path, *flags: object) -> list[str]:
+    """Arguments of `record --resume` with the settings of the folder and these flags."""
+    return list(map(str, ["--resume", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--out", folder, *flags]))
+
+
 def resume(world: Path, folder: Path, *flags: object) -> subprocess.CompletedProcess[str]:
-    """`record --resume` with the settings of the folder and these flags."""
-    places = ["--resume", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--out", folder]
-    arguments = [*command(world, "record")[:3], *map(str, [*places, *flags])]
+    """`record --resume` with the settings of the folder and these flags, in a process of its own."""
+    arguments = [*command(world, "record")[:3], *resumed(world, folder, *flags)]
     return subprocess.run(arguments, env=environment(world), capture_output=True, text=True, check=False)
 
 
@@ -276,7 +280,7 @@ def test_a_recording_killed_while_its_workers_start_leaves_no_process(world):
     process.stderr.close()
 
 
-def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_resume(world, reference):
+def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_resume(world, reference, capsys):
     """The local policy takes its worker along in one of the instances; everything else is as it would have been."""
     whole, _ = read_rollouts(reference[0])
     victim = whole[2 * REPEATS]
@@ -294,18 +298,21 @@ def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_r
     again = resume(world, world / "dying")
     assert again.returncode == 0 and "lost" not in again.stderr, again.stderr
     assert read_rollouts(world / "dying")[0] == [row for row in whole if row.repeat == 0]
-    assert "is complete" in resume(world, world / "dying").stderr
+    assert record_main(resumed(world, world / "dying")) == 0
+    assert "is complete" in capsys.readouterr().err
 
 
-def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, reference):
+def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, reference, capsys):
     folder = world / "failed"
     shutil.copytree(reference[0], folder)
     rows, metadata = read_rollouts(folder)
     rows[0] = dataclasses.replace(rows[0], success=False, error="PolicyError: the answer is not finite")
     write_rollouts(folder, rows, {key: value for key, value in metadata.items() if key != "schema_version"})
     before = files(folder)
-    done = resume(world, folder)
-    assert done.returncode == 0 and "is complete" in done.stderr and files(folder) == before
+    assert record_main(resumed(world, folder)) == 0
+    shown = capsys.readouterr()
+    assert "is complete" in shown.err and files(folder) == before
+    assert "1 episode of calm ended in an error, in short/test/0/40: PolicyError: the answer is not finite" in shown.out
 
 
 def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from osel_sim.interface.selector import Selector, SelectorFactory
     from osel_sim.interface.suite import Task
     from osel_sim.policy.objects import PolicyObject
+    from osel_sim.reporting.live_page import LivePage
     from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | SelectorFactory
@@ -72,6 +73,8 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """film so many decisions, spread evenly over the run"""
     view: Annotated[bool, OUTPUT] = False
     """show the run in the browser while it goes on: a page on this machine that grows every few decisions, with the last film"""
+    no_page: Annotated[bool, OUTPUT] = False
+    """do not write the page about it, which takes some seconds; python -m osel_sim.report does so later"""
     tensorboard: Annotated[bool, OUTPUT] = False
     """also write TensorBoard event files (needs the package tensorboard)"""
     realtime: Annotated[bool, OTHER] = False
@@ -152,7 +155,6 @@ class _Run:
         from osel_sim.api.reward import weights_of
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
-        from osel_sim.reporting.live_page import LivePage
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
         self.config, self.objects, self.factory, self.watchers = config, objects, factory, watchers
@@ -170,7 +172,7 @@ class _Run:
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
         self.axes_above = sorted({instance.axes for instance in drawn if instance.axes})
-        self.page = LivePage()
+        self.page = self._page()
 
     def execute(self) -> RunResult:
         """Do it."""
@@ -286,7 +288,15 @@ class _Run:
         config = self.config
         films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
-        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), self.page]
+        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
+
+    def _page(self) -> "LivePage | None":
+        """Writes the page, if one is wanted."""
+        if self.config.no_page:
+            return None
+        from osel_sim.reporting.live_page import LivePage
+
+        return LivePage()
 
     def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
@@ -302,9 +312,9 @@ class _Run:
         from osel_sim.api.run_files import write_results
 
         summary = write_results(live, title(self.tasks), self.config.selector)
-        if self.page.problem is not None:
+        if self.page is not None and self.page.problem is not None:
             logger.warning("no report.html: %s", self.page.problem)
-        return RunResult(live.folder, summary, tuple(live.decisions), self.page.file, interrupted)
+        return RunResult(live.folder, summary, tuple(live.decisions), self.page.file if self.page else None, interrupted)
 
 
 class _Interrupt:

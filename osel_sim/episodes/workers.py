@@ -5,6 +5,7 @@ worker dies as well, it becomes an error row, and a new worker does the rest of 
 """
 
 import functools
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -130,8 +131,6 @@ def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int, b
 
 def _recorder(plan: Plan) -> Work[_Job, Any]:
     """What a worker does: load encoder, policies and servers, then instance by instance."""
-    import torch
-
     from osel_sim.context.encoder import load_encoder
     from osel_sim.episodes.drivers import Drivers
     from osel_sim.episodes.loop import run_episode
@@ -140,8 +139,9 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
     from osel_sim.suites.open_tasks import OpenTasks
     from osel_sim.suites.registry import common_specification
 
-    torch.set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
     encoder, drivers = load_encoder(plan.encoder), Drivers(plan.everyone, common_specification(plan.tasks))
+    if "torch" in sys.modules:  # importing it takes longer than an episode, and not every encoder and policy needs it
+        sys.modules["torch"].set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
     envs = OpenTasks(plan.tasks, keep=2)  # work comes task by task
 
     def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | Row]":
