@@ -162,6 +162,8 @@ def test_ctrl_c_ends_with_what_there_is(world):
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["decisions"] == len(read_journal(folder / "episodes.jsonl")) >= 2
     assert "random" in output
+    (name, config), *_ = next_commands(output)  # goes on with it
+    assert name == "run" and config.resume and config.folder == folder and config.episodes == 500
 
 
 def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any
+from typing import Any, override
 
 from osel_sim.analysis.live import JOURNAL
 from osel_sim.core.errors import OselError
@@ -27,6 +27,16 @@ HOST = "127.0.0.1"
 FILM, VERSION = "/film.mp4", "/version"
 
 
+class _Server(ThreadingHTTPServer):
+    """Says nothing of browsers that hang up: it shares the terminal with the run."""
+
+    daemon_threads = True
+
+    @override
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        pass
+
+
 class WatchedPage:
     """A run's page, and a server of it on a free port.
 
@@ -35,28 +45,23 @@ class WatchedPage:
 
     Attributes:
         url: where it is.
+        html, version: the page as it is now, and how often it was made.
+        film: the last one.
+        asked: when a browser last asked for something, by the monotonic clock.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.version, self.film, self.asked = 0, None, 0.0
-        self._html = b""
-        self._seen = self._cost = self._made = 0.0
-        self._server = ThreadingHTTPServer((HOST, 0), _handler(self))
-        self._server.daemon_threads = True
+        self.html, self.version = b"", 0
+        self.film: Path | None = None
+        self.asked = 0.0
+        self._seen, self._cost, self._made = 0, 0.0, 0.0
+        self._server = _Server((HOST, 0), _handler(self))
         self.url = f"http://{HOST}:{self._server.server_port}/"
-
-    film: Path | None
-    """The last film."""
-
-    @property
-    def html(self) -> bytes:
-        """The page as it is now."""
-        return self._html
 
     def serve(self, stop: threading.Event) -> None:
         """Serve until `stop` is set and browsers had time for the last page."""
-        self._html = waiting_html(self.folder, Live(self.version)).encode()
+        self.html = waiting_html(self.folder, Live(self.version)).encode()
         threading.Thread(target=self._server.serve_forever, args=(LOOK,), daemon=True).start()
         try:
             while not stop.wait(LOOK):
@@ -88,9 +93,9 @@ class WatchedPage:
                 film = None if last is None else self._film_of(last.index, last.policy)
                 words = "" if last is None else f"Decision {last.index + 1}, {last.policy}: {last.instruction}"
                 live = Live(self.version + 1, FILM if film else "", words, len(decisions), over)
-                self._html, self.film, self.version = to_html(run_page(self.folder), live).encode(), film, self.version + 1
-        except OselError as error:  # such as a run folder that is being changed by hand
-            self._html, self.version = waiting_html(self.folder, Live(self.version + 1), str(error)).encode(), self.version + 1
+                self.html, self.film, self.version = to_html(run_page(self.folder), live).encode(), film, self.version + 1
+        except (OselError, OSError) as error:  # such as a run folder that is being changed by hand
+            self.html, self.version = waiting_html(self.folder, Live(self.version + 1), str(error)).encode(), self.version + 1
         self._seen, self._made, self._cost = size, time.monotonic(), time.thread_time() - start
 
     def _film_of(self, index: int, policy: str) -> Path:
