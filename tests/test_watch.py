@@ -48,12 +48,12 @@ def served(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
     thread.start()
     yield page, stop
     stop.set()
-    thread.join(20)
+    thread.join(60)
     assert not thread.is_alive()
 
 
 def get(page: watch.WatchedPage, path: str = "/", host: str | None = None) -> tuple[int, str]:
-    connection = http.client.HTTPConnection("127.0.0.1", urlsplit(page.url).port, timeout=10)
+    connection = http.client.HTTPConnection("127.0.0.1", urlsplit(page.url).port, timeout=60)
     connection.request("GET", path, headers={"Host": host} if host else {})
     answer = connection.getresponse()
     return answer.status, answer.read().decode("latin-1")
@@ -63,19 +63,19 @@ def test_the_page_grows_and_shows_the_last_film(served: tuple[watch.WatchedPage,
     page, stop = served
     assert "No decision is made yet" in get(page)[1] and get(page, "/film.mp4")[0] == 404
     beginning(whole, page.folder, 3)
-    assert wait_until(lambda: get(page, "/version")[1] == "1", 20)
+    assert wait_until(lambda: get(page, "/version")[1] == "1", 60)
     assert "3 decisions so far" in get(page)[1]
     last = read_journal(page.folder / "episodes.jsonl")[-1]
     (page.folder / "videos").mkdir()
     (page.folder / "videos" / f"00002-{last.policy.replace('/', '')}.mp4").write_bytes(b"a film")
     beginning(whole, page.folder, 5)
-    assert wait_until(lambda: get(page, "/version")[1] == "2", 20)
+    assert wait_until(lambda: get(page, "/version")[1] == "2", 60)
     text = get(page)[1]
     assert "5 decisions so far" in text and "Decision 3, " in text and 'data-version="2"' in text
     assert "connect-src 'self'" in text and '<video src="/film.mp4?2"' in text
     assert get(page, "/film.mp4?2") == (200, "a film")
     stop.set()
-    assert wait_until(lambda: "The run is over: 5 decisions" in get(page)[1], 20)
+    assert wait_until(lambda: "The run is over: 5 decisions" in get(page)[1], 60)
 
 
 def test_only_this_machine_is_answered_and_only_what_is_meant(served: tuple[watch.WatchedPage, threading.Event]) -> None:
@@ -84,7 +84,7 @@ def test_only_this_machine_is_answered_and_only_what_is_meant(served: tuple[watc
     assert get(page, "/run.json")[0] == get(page, "/../run.json")[0] == 404
     assert get(page, host="evil.example")[0] == 403
     page.folder.joinpath("episodes.jsonl").write_text("nonsense\n")
-    assert wait_until(lambda: "line 1: not JSON" in get(page)[1], 20)  # told, and looked at again
+    assert wait_until(lambda: "line 1: not JSON" in get(page)[1], 60)  # told, and looked at again
 
 
 def test_a_run_that_goes_on_is_reported_as_far_as_it_is(whole: Path, tmp_path: Path) -> None:
