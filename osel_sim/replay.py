@@ -28,10 +28,12 @@ Likewise of a log of somebody's own decisions (ingest --propensity)."""
 
 def _execute(config: ReplayConfig) -> int:
     from osel_sim.api.replay import replay
+    from osel_sim.cli.next_step import print_next
 
     result = replay(config, on_result=_print)
+    print(f"written to {result.folder}")
     page = result.folder if result.result is not None else config.log  # of estimates alone: the page is the run's, or the log's
-    print(f"written to {result.folder}; python -m osel_sim.report {page} makes a page of it")
+    print_next(("makes a page of it", "report", [page, "--open"]))
     return 0
 
 

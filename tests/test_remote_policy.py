@@ -18,7 +18,7 @@ from osel_sim.policy.local import LocalCaller
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.codec import pack
 from osel_sim.remote.network import PROFILES, NetworkModel, NetworkProfile
-from osel_sim.remote.policy import RemotePolicy, open_remote
+from osel_sim.remote.policy import RemotePolicy, check_servers, open_remote
 from osel_sim.remote.process import PolicyServerProcess
 
 
@@ -283,8 +283,10 @@ def test_a_server_of_somebody_else(tmp_path, url, monkeypatch):
     with pytest.raises(RemoteError, match=r"serves Greeting.*expected Greeting"):
         open_remote(policy_spec(tmp_path, name="other", url=url), ENVIRONMENT, timeout=5)
     monkeypatch.delenv("OSEL_SIM_TOKEN")
-    with pytest.raises(RemoteError, match="refused the token"):
-        open_remote(policy_spec(tmp_path, url=url), ENVIRONMENT, timeout=5)
+    for reach in (open_remote, lambda spec, environment, timeout: check_servers([spec], environment, timeout)):
+        with pytest.raises(RemoteError, match=r"policy 'sinusoid' \(.*\): .*: wants a token: put it into the environment variable OSEL_SIM_TOKEN"):
+            reach(policy_spec(tmp_path, url=url), ENVIRONMENT, timeout=5)
+    check_servers([policy_spec(tmp_path)], ENVIRONMENT)  # one that would be started here is not tried
     assert GREETING.policy == "sinusoid"
 
 

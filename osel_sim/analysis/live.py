@@ -9,11 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.log import Array, LoggedInstance, LoggedOutcomes, dense, named_robots, read_contexts
+from osel_sim.context.cache import FILE, ContextCache
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import read_json
 from osel_sim.formats.counterfactual import COUNTERFACTUAL, to_others
 from osel_sim.formats.journal import JOURNAL, SEEDS_PER_RUN, TIMING, Decision, check_beside, read_journal, read_lines
 from osel_sim.formats.rollout_log import ROLLOUTS, Row
 from osel_sim.formats.run_config import RUN, read_run
+from osel_sim.formats.summary import SUMMARY
 from osel_sim.formats.toml_types import quoted
 from osel_sim.formats.values import COUNT, NAME, TEXT
 from osel_sim.interface.outcome import Outcome
@@ -28,7 +31,7 @@ class LiveLog:
     """T decisions, P policies.
 
     Attributes:
-        decisions: (T,) of the journal.
+        decisions: (T,) of the journal; none of a log of somebody else's decisions.
         outcomes: one instance a decision, one repeat; NaN for the policies that were not chosen, unless the run was made with `--counterfactual`.
         chosen: (T,) columns.
         propensities: (T, P) with which each policy would have been chosen.
@@ -64,9 +67,10 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     """
     configuration = _configuration(folder)
     policies, weights = configuration["policies"], weights_from(configuration["reward"], f"{folder / RUN}: configuration.reward")
-    decisions = read_journal(folder / JOURNAL)
+    journal = read_journal(folder / JOURNAL)
     for name in (COUNTERFACTUAL, TIMING):
-        check_beside(folder / name, len(decisions))
+        check_beside(folder / name, len(journal))
+    decisions = _as_far_as_contexts(folder, journal, encoder or configuration.get("encoder"))
     if not decisions:
         raise DataError(f"{folder / JOURNAL}: the run made no decision")
     for decision in decisions:
@@ -89,6 +93,17 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     propensities = np.array([[decision.propensities.get(policy, 0.0) for policy in policies] for decision in decisions], np.float64)
     chosen = np.array([policies.index(decision.policy) for decision in decisions], np.int64)
     return LiveLog(tuple(decisions), outcomes, chosen, propensities, str(configuration.get("selector", "unknown")), asdict(weights))
+
+
+def _as_far_as_contexts(folder: Path, decisions: list[Decision], encoder: str | None) -> list[Decision]:
+    """The decisions without the last few that have no context yet, in a run that goes on or was killed: contexts are written some at a time."""
+    if encoder is None or not (folder / FILE).is_file():
+        return decisions
+    cache = ContextCache(folder)
+    have = [cache.get(encoder, decision.instance) is not None for decision in decisions]
+    known = sum(have)
+    finished = read_json(folder / SUMMARY).get("decisions", 0) if (folder / SUMMARY).is_file() else 0
+    return decisions[:known] if all(have[:known]) and known > 0 and known >= finished else decisions
 
 
 def _configuration(folder: Path) -> dict[str, Any]:

@@ -164,7 +164,7 @@ def _refuse(config: IngestConfig, names: Sequence[str], with_what: str) -> None:
 
 def _table(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.context.encoder import load_log_encoder
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF
     from osel_sim.core.files import file_digest
     from osel_sim.core.images import load_image
@@ -214,7 +214,7 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
 
 def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.context.encoder import load_log_encoder
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF
     from osel_sim.episodes.drivers import choose_policies
     from osel_sim.formats.dataset_mapping import load_dataset_mapping

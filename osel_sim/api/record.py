@@ -74,6 +74,7 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
     from osel_sim.episodes.declared_skills import declare
     from osel_sim.episodes.recording import Recording
     from osel_sim.formats.run_config import RUN, check_run_folder, read_run, start_or_resume
+    from osel_sim.remote.policy import check_servers
     from osel_sim.suites.ran_with import ran_with
 
     plan = _plan(config)
@@ -81,6 +82,8 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
     before = read_run(folder) if config.resume and (folder / RUN).exists() else None
     known = configuration if before is None else _as_it_began(configuration, before["configuration"])
     check_run_folder(folder, known, config.resume)
+    if before is None:
+        check_servers(plan.everyone, plan.tasks[0].specification)
     encoder = load_encoder(plan.encoder)
     skills = declare(plan.policies, encoder, plan.tasks, config.tasks)
     configuration["encoder"] = encoder.identity
@@ -110,7 +113,7 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
 
 
 def _plan(config: RecordConfig) -> "Plan":
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
@@ -212,10 +215,11 @@ def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
     plan, missing = recording.plan, recording.missing()
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
     unit = "episode" if left else "context"
+    logger.info("starting %d workers: they load the encoder%s ...", workers, ", policies and servers" if left else "")
     start = time.perf_counter()
     done = successes = 0
     with progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar:
-        for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers):  # contexts alone need no policy
+        for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers, bar.begin):  # contexts alone need no policy
             if recorded is None:
                 bar.update()
                 continue

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import logging
 import os
 import secrets
 import sys
@@ -12,11 +13,14 @@ from typing import IO, TYPE_CHECKING, Annotated
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UsageError
 from osel_sim.core.trust import trusting
+from osel_sim.remote.address import check_address
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 from osel_sim.remote.serving import run_until_signal, stop_with_stdin
 
 if TYPE_CHECKING:
     from osel_sim.interface.environment import EnvironmentSpec
+
+logger = logging.getLogger(__name__)
 
 
 @settings
@@ -85,6 +89,10 @@ def _serve(config: ServeConfig, out: IO[str]) -> None:
     if given is None and not is_loopback(config.host):
         raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
+    check_address(config.host, config.port)
+    if not config.watch_stdin:  # who starts the server itself knows
+        secret = f"the token in {config.token_env}" if given is not None else f"a token that is printed then (none is in {config.token_env})"
+        logger.info("loading %s; clients connect to port %s of %s with %s ...", spec.name, config.port or "(a free one)", config.host, secret)
     environment = _environment(config)
     greeting = Greeting.of(spec, environment)
     make_session = session_factory(spec, environment)

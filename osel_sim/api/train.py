@@ -157,7 +157,7 @@ def train_encoder(config: EncoderTrainConfig | None = None, /, **values: Any) ->
     Raises:
         OselError: whatever is wrong with the settings or the folder; the message says what.
     """
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.suites.registry import select_task_files
     from osel_sim.training.encoder import train as encoder_training
 

@@ -10,6 +10,7 @@ from rich.segment import Segment
 from rich.text import Text
 
 from osel_sim.core.shown import shown
+from osel_sim.selection.registry import RECOMMENDATION, is_recommended
 
 
 class SafeConsole(Console):
@@ -68,6 +69,8 @@ def run_table(summary: dict[str, Any]) -> Table:
     """The selector, each policy where it was chosen, and with a counterfactual what could have been."""
     headings = ("decisions", "mean reward", "success [95%]", "steps", "seconds", "price (cents)", "fallbacks", "errors")
     found = Table(f"{summary['task']}: {summary['decisions']} decisions", [""], headings)
+    if not is_recommended(summary["selector"]):
+        found.caption, found.caption_justify = plain(f"{RECOMMENDATION}."), "left"
     chosen = ((plain(f"  chose {name}"), part) for name, part in summary["policies"].items())
     for name, part in ((plain(summary["selector"], "bold"), summary), *chosen):
         found.add(

@@ -1,4 +1,4 @@
-"""The tasks, robots, policies and suites there are, for `python -m osel_sim.run --list`: reads TOML and imports no simulator."""
+"""What there is to choose from, for `python -m osel_sim.run --list`: reads TOML and imports no simulator."""
 
 import contextlib
 import json
@@ -7,18 +7,22 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from osel_sim.api.reward import DEFAULT_PRESET
+from osel_sim.context.names import ABOUT, FORMS, PLUGINS, embedded_encoders
 from osel_sim.core import content
 from osel_sim.core.errors import OselError
 from osel_sim.core.shown import all_shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.selection import registry as selectors
+from osel_sim.selection.weights import PRESETS
 from osel_sim.sim.robots import ROBOTS
 from osel_sim.suites import SUITES
 
 
 def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str, list[dict[str, Any]]]:
-    """All tasks, robots, policies and suites of others, by name, as plain data.
+    """All tasks, robots, policies, suites of others, selectors, encoders and reward presets, by name, as plain data.
 
     Args:
         tasks: a folder of the user's own task files.
@@ -32,6 +36,9 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
         "robots": [{"name": name} for name in sorted(ROBOTS.locations())],
         "policies": [_policy(load_policy_file(file)) for _, file in sorted(content.files("policies", policies).items())],
         "suites": [_suite(name) for name in SUITES.others()],
+        "selectors": [{"name": name, "about": selectors.ABOUT.get(name, f"of another package ({place})")} for name, place in _selectors()],
+        "encoders": [{"name": name, "about": about} for name, about in _encoders()],
+        "presets": [{"name": name, **asdict(weights)} for name, weights in PRESETS.items()],
     }
 
 
@@ -43,6 +50,7 @@ def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Pa
         print(json.dumps(found, indent=2))
         return
     from osel_sim.cli.console import Table, console, plain
+    from osel_sim.cli.next_step import print_next
 
     columns = ("task", "title", "tags", "steps")
     table = Table("Tasks", columns)
@@ -60,6 +68,30 @@ def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Pa
         where = "local" if policy["remote"] is None else f"remote ({policy['remote']['network']})"
         table.add(policy["name"], policy["title"], where + (", privileged" if policy["privileged"] else ""), policy["kind"])
     console().print(table)
+    for things, heading in (("selectors", "Selectors, for --selector"), ("encoders", "Encoders of contexts, for --encoder")):
+        table = Table(heading, ("name", "what it is"))
+        for thing in found[things]:
+            table.add(thing["name"], thing["about"])
+        console().print(table)
+    table = Table("Reward weights of the paper, for --preset", ("preset", "reward"))
+    for weights in found["presets"]:
+        reward = f"{weights['success']} - {weights['alpha_time']:g} {weights['time_unit']} - {weights['alpha_price']:g} cents"
+        table.add(weights["name"], reward + (" (default)" if weights["name"] == DEFAULT_PRESET else ""))
+    console().print(table)
+    names, own = [task["name"] for task in found["tasks"]], ["--tasks", tasks] if tasks is not None else []
+    first = "pick_place" if "pick_place" in names else names[0]
+    print_next(("runs a task with the selector we recommend", "run", ["--task", first, *own, "--selector", selectors.RECOMMENDED]))
+
+
+def _selectors() -> list[tuple[str, str]]:
+    """Name and place of each, the recommended one first."""
+    return sorted(selectors.selector_locations().items(), key=lambda item: (item[0] != selectors.RECOMMENDED, item[0]))
+
+
+def _encoders() -> list[tuple[str, str]]:
+    """Names and forms of names, with a line about each."""
+    own = [(name, ABOUT.get(name, "comes with the package")) for name in embedded_encoders()]
+    return [*own, *((name, f"of another package ({PLUGINS.locations()[name]})") for name in PLUGINS.others()), *FORMS.items()]
 
 
 def _task(task: TaskSpec) -> dict[str, Any]:

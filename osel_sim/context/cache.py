@@ -24,7 +24,7 @@ class ContextCache:
 
     Args:
         folder: where `contexts.npz` lies or will lie.
-        autosave: write the file whenever that many new contexts came in (0: only on `save`).
+        autosave: write the file whenever that many new contexts came in, and a twentieth of those that are there (0: only on `save`).
 
     Raises:
         DataError: the file that is there cannot be read or has another form.
@@ -85,7 +85,7 @@ class ContextCache:
             raise UsageError(f"contexts of encoder {encoder!r} have length {len(next(iter(known.values())))}, got {len(context)}")
         known[instance] = context
         self._unsaved += 1
-        if self._autosave and self._unsaved >= self._autosave:
+        if self._autosave and self._unsaved >= max(self._autosave, len(known) // 20):
             self.save()
 
     def encode(self, encoder: Encoder, instance: str, images: Callable[[], Sequence[Image]], instruction: str) -> Context:

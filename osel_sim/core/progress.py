@@ -1,6 +1,6 @@
 """Progress bars: in a terminal on standard error, in a notebook as a widget."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -8,10 +8,24 @@ from osel_sim.core.shown import shown
 
 
 class Bar:
-    """A progress bar that is being shown."""
+    """A progress bar.
 
-    def __init__(self, bar: Any) -> None:
-        self._bar = bar
+    Args:
+        make: makes the bar of tqdm, which is shown, and counts time, from then on.
+    """
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self._make, self._made = make, None
+
+    @property
+    def _bar(self) -> Any:
+        if self._made is None:
+            self._made = self._make()
+        return self._made
+
+    def begin(self) -> None:
+        """Show the bar, if it is not shown yet: loading and compiling before this count for no estimate of the time that is left."""
+        self.update(0)
 
     def update(self, count: int = 1) -> None:
         """Advance by so many units."""
@@ -26,12 +40,17 @@ class Bar:
         """Show a text behind the bar from its next update on."""
         self._bar.set_postfix_str(_line(text), refresh=False)
 
+    def close(self) -> None:
+        """End the bar; it stays where it is."""
+        if self._made is not None:
+            self._made.close()
+
 
 @contextmanager
 def progress(
     total: int | None, unit: str, description: str | None = None, *, initial: int = 0, scale: bool = False, quiet: bool = False
 ) -> Iterator[Bar]:
-    """Show a progress bar for the length of the block.
+    """Give a progress bar for the length of the block. It is shown from its first use on, such as `begin`.
 
     Args:
         total: number of units; None if not known yet.
@@ -44,8 +63,11 @@ def progress(
     from tqdm.auto import tqdm  # type: ignore[import-untyped]
 
     desc = None if description is None else _line(description)
-    with tqdm(total=total, initial=initial, unit=unit, unit_scale=scale, desc=desc, dynamic_ncols=True, disable=quiet) as bar:
-        yield Bar(bar)
+    bar = Bar(lambda: tqdm(total=total, initial=initial, unit=unit, unit_scale=scale, desc=desc, dynamic_ncols=True, disable=quiet))
+    try:
+        yield bar
+    finally:
+        bar.close()
 
 
 def _line(text: str) -> str:

@@ -78,7 +78,8 @@ class LiveRun:
         self.folder, self.tasks, self.encoder = folder, tasks, encoder
         self.drivers, self.selector, self.options = drivers, selector, options
         self.subscribers = subscribers
-        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder)
+        # Contexts are on disk about as soon as their decisions: a run that goes on, or was killed, can be reported on.
+        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder, autosave=1)
         self.decisions = [to_decision(data, index, folder / JOURNAL) for index, (data, _) in enumerate(read_lines(folder / JOURNAL))]
         check_beside(folder / COUNTERFACTUAL, len(self.decisions), complete=options.counterfactual)
         check_beside(folder / TIMING, len(self.decisions))

@@ -13,7 +13,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketExce
 from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.core.errors import PolicyError, RemoteError
-from osel_sim.core.shown import shown
+from osel_sim.core.shown import TOKEN_VARIABLE, shown
 from osel_sim.formats.conventions import Conventions
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Actions, Observation
@@ -181,7 +181,7 @@ class RemoteClient:
             connection = self._hang_up.enter_context(opening)
         except InvalidStatus as error:
             status = error.response.status_code
-            raise RemoteError(f"{self.url}: " + ("refused the token" if status in (401, 403) else f"answered HTTP {status}")) from None
+            raise RemoteError(f"{self.url}: " + (self._unauthorised() if status in (401, 403) else f"answered HTTP {status}")) from None
         except TimeoutError:
             raise RemoteError(f"{self.url}: no connection within {self._timeout:g} s") from None
         except OSError as error:
@@ -194,6 +194,11 @@ class RemoteClient:
         with contextlib.suppress(OSError):  # the server has hung up already, and its socket is closed: the next receive says so
             connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", int(seconds), int(fraction * 1e6)))
         return connection
+
+    def _unauthorised(self) -> str:
+        if self._token:
+            return f"refused the token; the environment variable {TOKEN_VARIABLE} holds the one that is sent"
+        return f"wants a token: put it into the environment variable {TOKEN_VARIABLE}"
 
     def _ask(self, message: Any) -> tuple[Any, int]:
         if self._connection is None:

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import time
+from collections.abc import Sequence
 
 from osel_sim.core.errors import RemoteError, UsageError
 from osel_sim.formats.policy_file import PolicySpec
@@ -128,11 +129,10 @@ def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float =
         raise UsageError(f"{spec.file}: is not a remote policy")
     check_environment(spec, environment)
     if spec.remote.url is not None:
-        token = os.environ.get(TOKEN_VARIABLE)
-        client = RemoteClient(spec.remote.url, environment, token, timeout, Greeting.of(spec, environment), spec.mapping)
-        client.connect()
+        client = _connected(spec, environment, timeout)
         if client.foreign:
             client.close()
+            token = os.environ.get(TOKEN_VARIABLE)
             # A server that compiles its model with the first request takes long for it.
             _try_mapping(spec, environment, RemoteClient(spec.remote.url, environment, token, start_timeout, mapping=spec.mapping))
         return RemotePolicy(spec, client)
@@ -143,6 +143,37 @@ def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float =
         client.connect()
         undo.pop_all()
     return RemotePolicy(spec, client, server=server)
+
+
+def check_servers(specs: Sequence[PolicySpec], environment: EnvironmentSpec, timeout: float = 10.0) -> None:
+    """Connect to the servers that are not started here and hang up again, so that one that is not there is told of before anything is loaded.
+
+    Args:
+        specs: policies, of which only those with a `url` are tried.
+        environment: what they will drive.
+        timeout: real seconds for each.
+
+    Raises:
+        RemoteError: naming the policy: nobody there, the token refused or missing, or not a policy server.
+    """
+    for spec in specs:
+        if spec.remote is not None and spec.remote.url is not None:
+            _connected(spec, environment, timeout).close()
+
+
+def _connected(spec: PolicySpec, environment: EnvironmentSpec, timeout: float) -> RemoteClient:
+    """A connection to the `url` of a policy file.
+
+    Raises:
+        RemoteError: naming the policy.
+    """
+    url = spec.remote.url if spec.remote else None
+    client = RemoteClient(url or "", environment, os.environ.get(TOKEN_VARIABLE), timeout, Greeting.of(spec, environment), spec.mapping)
+    try:
+        client.connect()
+    except RemoteError as error:
+        raise RemoteError(f"policy {spec.name!r} ({spec.file}): {error}") from None
+    return client
 
 
 def _try_mapping(spec: PolicySpec, environment: EnvironmentSpec, client: RemoteClient) -> None:

@@ -9,7 +9,7 @@ from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.logged_choices import choices_of, has_choices
 from osel_sim.analysis.outcomes import overall, remote_policies
 from osel_sim.core.errors import DataError
-from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.formats.rollout_log import Row, read_rollouts
 from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, cluster_blocks, frontier_figure, weights_blocks
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_sections import context_figure, formula, policy_blocks, rates_table, time_figure
@@ -19,11 +19,12 @@ from osel_sim.reporting.routes import route_figure
 from osel_sim.selection.reward import RewardWeights
 
 
-def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_scenes) -> Page:
+def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_scenes, rows: Sequence[Row] | None = None) -> Page:
     """The page of a rollout log: what its policies came to, and whether there is something to route by.
 
     Args:
         scenes: draws how some of its instances begin.
+        rows: of the log; None: read from its folder.
 
     Raises:
         DataError: the log lacks what the weights ask for.
@@ -33,7 +34,7 @@ def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_sc
     if found is not None:
         sections.insert(0, Section("off_policy", "Other ways of choosing", [off_policy_table(found)]))
     title = f"{few(sorted(set(log.labels('task'))))}: {len(log):,} instances, {len(log.policies)} policies"
-    rows, _ = read_rollouts(log.source)
+    rows = read_rollouts(log.source)[0] if rows is None else rows
     episodes = list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes(log))
     verdict = off_policy_verdict(found) if found is not None else _verdict(log, weights, routing)
     return Page("Rollout log", title, verdict, sections, log_facts(log, weights), episodes, route_figure(log, weights))

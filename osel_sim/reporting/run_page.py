@@ -1,7 +1,7 @@
 """The page of a live run."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdic
 from osel_sim.reporting.palette import colours
 from osel_sim.reporting.routes import Chosen, route_figure
 from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, look_of, penalty_figure, regret_figure
+from osel_sim.selection.registry import RECOMMENDATION, is_recommended
 from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
 from osel_sim.statistics.betting import advantage_bounds
 
@@ -167,6 +168,11 @@ def _chosen_table(run: _Run, selector: str) -> Table:
 
 
 def _verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
+    verdict = _own_verdict(run, selector, streams)
+    return verdict if is_recommended(selector) else replace(verdict, sentences=[*verdict.sentences, f"{RECOMMENDATION}."])
+
+
+def _own_verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
     own = streams[selector]
     reward, success = mean_of(own.reward), rate_of(own.success.T)
     rate = f"95% [{100 * success.low:.0f}, {100 * success.high:.0f}]" if success else ""
