@@ -7,6 +7,8 @@ WORKERS ?= 2
 ARGS ?=
 # One thread a process: the tests run in several, and simulation gains nothing from more.
 ONE_THREAD := OMP_NUM_THREADS=1
+# Neighbours stay together, so that what a file of tests shares (a run, a recording, pages) is made once, not once in every process.
+SHARED := -n $(WORKERS) --dist worksteal
 
 SHORT := open_drawer close_drawer press_button door pick_place lift
 # What the specialists were weak at with as few demonstrations as the others.
@@ -21,10 +23,10 @@ run: $(READY)
 	$(PYTHON) -m osel_sim.run --task pick_place --policies local_small remote_large --counterfactual --video 3 --out $(OUT) $(ARGS)
 
 test: $(READY)
-	$(ONE_THREAD) $(PYTHON) -m pytest -m "not slow" -n $(WORKERS) $(ARGS)
+	$(ONE_THREAD) $(PYTHON) -m pytest -m "not slow" $(SHARED) $(ARGS)
 
 slow: $(READY)
-	$(ONE_THREAD) $(PYTHON) -m pytest -m slow -n $(WORKERS) $(ARGS)
+	$(ONE_THREAD) $(PYTHON) -m pytest -m slow $(SHARED) $(ARGS)
 
 lint: $(READY)
 	.venv/bin/ruff check .
@@ -78,6 +80,7 @@ $(READY): requirements.txt pyproject.toml
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check "$$(grep '^uv==' requirements.txt)"
 	.venv/bin/uv pip install --quiet --compile-bytecode --python $(PYTHON) --no-deps -r requirements.txt
 	.venv/bin/uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
+	$(PYTHON) -m osel_sim.cli.prepare
 	@touch $@
 
 clean:

@@ -96,8 +96,18 @@ def in_processes(options: argparse.Namespace) -> float:
         folder = Path(name)
         cache = ContextCache(folder, autosave=0)
         rows = []
-        plain = {"task": "t", "seed": 0, "level": 0, "split": "test", "instruction": "", "phrasing": "", "target": "", "container": "", "repeat": 0}
-        plain |= {"upload": 0.0, "inference": 0.0, "download": 0.0, "motion": 1.0, "calls": 1, "actions": 1, "price": 0.0, "steps": 1}
+        plain = {
+            "task": "t",
+            "seed": None,
+            "level": None,
+            "split": "test",
+            "instruction": "",
+            "phrasing": "",
+            "target": "",
+            "container": "",
+            "repeat": 0,
+        }
+        plain |= {"repeat": 0, "upload": 0.0, "inference": 0.0, "download": 0.0, "motion": 1.0, "calls": 1, "actions": 1, "price": 0.0, "steps": 1}
         for index in range(options.decisions):
             cache.put("made_up@1", f"{index}", contexts[index])
             for column, policy in enumerate(POLICIES):

@@ -15,6 +15,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from osel_sim.core import this_python
+
 if TYPE_CHECKING:
     from osel_sim.api.collect import CollectConfig, collect
     from osel_sim.api.ingest import IngestConfig, ingest
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
     from osel_sim.core.errors import OselError
     from osel_sim.policy.objects import as_policy
     from osel_sim.selection.base import SelectorBase
+
+if getattr(sys, "argv", [])[:1] == ["-m"]:  # what it is while `python -m osel_sim.COMMAND` looks for the command
+    this_python.check()
 
 _PLACES = {
     "CollectConfig": "api.collect",
@@ -76,10 +81,16 @@ def __getattr__(name: str) -> Any:
     if name not in _PLACES:
         raise AttributeError(f"module 'osel_sim' has no attribute {name!r}")
     import_module("osel_sim.core.caches").prepare()
-    return getattr(import_module(f"osel_sim.{_PLACES[name]}"), name)
+    try:
+        return getattr(import_module(f"osel_sim.{_PLACES[name]}"), name)
+    except (ModuleNotFoundError, SyntaxError):
+        found = this_python.problem()
+        if found:
+            raise ImportError(found) from None
+        raise
 
 
-def __dir__() -> list[str]:
+def __dir__() -> "list[str]":
     return sorted([*globals(), *_PLACES])
 
 

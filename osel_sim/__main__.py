@@ -4,6 +4,8 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from osel_sim.core import this_python
+
 COMMANDS = {
     "run": "let a selector choose live which policy handles each instance",
     "record": "run every policy on the same instances: a rollout log",
@@ -20,6 +22,7 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit code."""
+    this_python.check()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and words[0] in COMMANDS:
         code: int = import_module(f"osel_sim.{words[0]}").main(words[1:])

@@ -14,9 +14,13 @@ EXAMPLES = """examples:
 
 def _execute(config: CollectConfig) -> int:
     from osel_sim.api.collect import collect
+    from osel_sim.cli.next_step import print_next
 
-    for line in collect(config).collected:
+    result = collect(config)
+    for line in result.collected:
         print(line)
+    out = config.out or result.datasets[0]
+    print_next(("trains a policy on it", "train", ["--policy", "local_small", "--data", out, "--out", "runs/train/local_small"]))
     return 0
 
 

@@ -39,6 +39,7 @@ class GalleryConfig(Settings):
 
 
 def _execute(config: GalleryConfig) -> int:
+    from osel_sim.cli.next_step import print_next
     from osel_sim.reporting.contact_sheet import SheetOptions, contact_sheet
     from osel_sim.suites.registry import ALL, select_tasks
 
@@ -53,7 +54,8 @@ def _execute(config: GalleryConfig) -> int:
 
     config.out.parent.mkdir(parents=True, exist_ok=True)
     write_bytes(config.out, cv2.imencode(".png", picture[:, :, ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes())
-    print(f"{config.out}: {picture.shape[1]} x {picture.shape[0]} pixels")
+    print(f"written to {config.out}: {picture.shape[1]} x {picture.shape[0]} pixels")
+    print_next(("runs one of them", "run", ["--task", tasks[0].name, *(["--tasks", config.tasks] if config.tasks else []), "--level", 0, 2]))
     return 0
 
 

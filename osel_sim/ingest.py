@@ -1,9 +1,14 @@
 """Turn outcome tables of others into a rollout log: `python -m osel_sim.ingest --map mapping.toml --out logs/theirs`."""
 
+import shlex
 import sys
+from typing import TYPE_CHECKING
 
 from osel_sim.api.ingest import IngestConfig
 from osel_sim.cli.command import Command
+
+if TYPE_CHECKING:
+    from osel_sim.api.ingest import IngestResult
 
 EXAMPLES = """examples:
   # a mapping file says what the columns mean (examples/mmlu.toml)
@@ -22,11 +27,18 @@ EXAMPLES = """examples:
   python -m osel_sim.ingest --files episodes.jsonl --text instruction --group task_type --policy-column model --repeat-column trial \\
       --success solved --subgoals fraction --steps steps --price cents --out logs/alfred
 
+  # other units, nested JSON
+  python -m osel_sim.ingest --files answers.jsonl --text question --policy-column model --success scores.exact --seconds time_ms/1000 \\
+      --price usage.usd --price-unit usd --out logs/theirs
+
+  # decisions that were made, with the probability of each choice: what would others have earned?
+  python -m osel_sim.ingest --files requests.parquet --text prompt --policy-column model --success ok --propensity p --out logs/requests
+
   # minus the error of the actions that policies would have taken on logged observations (Open X-Embodiment)
   python -m osel_sim.ingest --metric action-mse --dataset data/bridge data/fractal --policies local_small remote_large --out logs/oxe
 
 Writes rollouts.parquet and contexts.npz into --out, nothing if the table is wrong. The same command goes on with an interrupted encoding, and another
---encoder adds its contexts to the log. How a mapping file looks: the top of osel_sim/ingestion/columns.py."""
+--encoder adds its contexts to the log. How a mapping file looks, and all that is taken: docs/tables.md."""
 
 
 def _execute(config: IngestConfig) -> int:
@@ -40,9 +52,19 @@ def _execute(config: IngestConfig) -> int:
         print(note)
     print(f"{result.folder}: {len(result.rows)} rows, contexts of {result.encoder}, {result.seconds:.0f} s")
     print_rollouts(console(), result.rows, weights)
-    print(f"reward ({preset}): {weights.success} - {weights.alpha_time} {weights.time_unit} - {weights.alpha_price} cents")
-    print(f"written to {result.folder}; python -m osel_sim.replay {result.folder} --preset {preset} replays it to selectors")
+    print(f"reward ({preset}): {weights.success} - {weights.alpha_time} {weights.time_text} - {weights.alpha_price} cents")
+    print(f"written to {result.folder}; python -m osel_sim.replay {shlex.quote(str(result.folder))}{_flags(result, preset)} replays it to selectors")
     return 0
+
+
+def _flags(result: "IngestResult", preset: str) -> str:
+    """Flags for a replay by the same weights, as far as the log knows what they weigh."""
+    from osel_sim.api.reward import DEFAULT_PRESET
+
+    frame = result.outcomes
+    flags = "" if preset == DEFAULT_PRESET else f" --preset {preset}"
+    flags += " --alpha-time 0" if frame[["steps", "upload", "inference", "download", "motion"]].isna().all(axis=None) else ""
+    return flags + (" --alpha-price 0" if frame["price"].isna().all() else "")
 
 
 main = Command("ingest", IngestConfig, _execute, EXAMPLES)

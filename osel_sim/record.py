@@ -34,12 +34,24 @@ def _execute(config: RecordConfig) -> int:
             f"{result.recorded} episodes in {result.seconds:.0f} s with {config.workers} workers: {hourly:.0f} episodes an hour, starting up included"
         )
     _print_summary(result.folder)
-    print(f"written to {result.folder}; python -m osel_sim.replay {result.folder} replays it to selectors")
+    print(f"written to {result.folder}")
+    _print_next(result.folder)
     return 0
+
+
+def _print_next(folder: Path) -> None:
+    from osel_sim.cli.next_step import print_next
+
+    print_next(
+        ("replays it to selectors: is routing worth it?", "replay", [folder]),
+        ("makes a page of it", "report", [folder, "--open"]),
+        ("records one more policy on the same instances", "record", ["--resume", "--out", folder, "--policies", "NAME"]),
+    )
 
 
 def _print_summary(folder: Path) -> None:
     from osel_sim.api.reward import DEFAULT_PRESET
+    from osel_sim.cli.causes import print_causes
     from osel_sim.cli.console import console
     from osel_sim.cli.rollout_tables import print_rollouts
     from osel_sim.formats.rollout_log import read_rollouts
@@ -50,13 +62,15 @@ def _print_summary(folder: Path) -> None:
         raise DataError(f"{folder}: the rollout log has no rows")
     weights = preset(DEFAULT_PRESET)
     print_rollouts(console(), rows, weights)
-    print(f"reward: success - {weights.alpha_time} log10(seconds) - {weights.alpha_price} cents; episodes with errors count nowhere else")
+    print_causes((row.policy, row.instance, row.error) for row in rows if row.error)
+    print(f"reward: success - {weights.alpha_time} {weights.time_text} - {weights.alpha_price} cents; episodes with errors count nowhere else")
 
 
 def _summary(given: Mapping[str, Any]) -> int:
     if not given["summary"].is_dir():
         raise SettingError("summary", f"there is no folder {given['summary']}")
     _print_summary(given["summary"])
+    _print_next(given["summary"])
     return 0
 
 

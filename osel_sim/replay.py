@@ -22,14 +22,18 @@ With --half a selector that learns off-policy can be shown all outcomes of the o
 Once that is said and written, selectors are replayed at other weights of time and price too, for the frontier: about half as long again.
 
 Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv, frontier.csv. Of a live run's folder it estimates
-what each fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes."""
+what each fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes.
+Likewise of a log of somebody's own decisions (ingest --propensity)."""
 
 
 def _execute(config: ReplayConfig) -> int:
     from osel_sim.api.replay import replay
+    from osel_sim.cli.next_step import print_next
 
     result = replay(config, on_result=_print)
-    print(f"written to {result.folder}; python -m osel_sim.report {result.folder} makes a page of it")
+    print(f"written to {result.folder}")
+    page = result.folder if result.result is not None else config.log  # of estimates alone: the page is the run's, or the log's
+    print_next(("makes a page of it", "report", [page, "--open"]))
     return 0
 
 
@@ -42,7 +46,7 @@ def _print(result: ReplayResult) -> None:
     if result.result is not None:
         print_replay(console(), result.result)
     else:
-        print("The run has the outcomes of what was chosen only, so selectors cannot be replayed on it; run it with --counterfactual for that.")
+        print("Only the outcomes of what was chosen are known, so selectors cannot be replayed (a live run has all with --counterfactual).")
 
 
 main = Command("replay", ReplayConfig, _execute, EXAMPLES)

@@ -7,6 +7,7 @@ from osel_sim.cli.command import Command
 
 EXAMPLES = """examples:
   python -m osel_sim.report runs/first --open              # a live run (osel_sim.run)
+  python -m osel_sim.report runs/first --watch             # a live run that goes on: the page grows with it
   python -m osel_sim.report replays/first                  # a replay (osel_sim.replay)
   python -m osel_sim.report assets/logs/pick_place --out /tmp/page --alpha-price 0.02     # a rollout log (osel_sim.record)
 
@@ -14,9 +15,15 @@ Writes report.html, one file that needs no network, with figures/*.png, figures/
 
 
 def _execute(config: ReportConfig) -> int:
-    from osel_sim.api.report import report
+    from osel_sim.api.report import report, watch
 
-    print(f"written to {report(config).page}")
+    if config.watch:
+        watch(config, lambda url: print(f"{url} shows {config.folder} as it grows", flush=True))
+        return 0
+    page = report(config).page
+    print(f"written to {page}")
+    if not config.open:
+        print(f"next: open {page.resolve().as_uri()} in a browser, or give --open")
     return 0
 
 

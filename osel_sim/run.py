@@ -2,11 +2,13 @@
 
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from osel_sim.api.run import RunConfig
 from osel_sim.cli.command import INTERRUPTED, Command
-from osel_sim.core.shown import shown
+
+if TYPE_CHECKING:
+    from osel_sim.api.results import RunResult
 
 EXAMPLES = """examples:
   python -m osel_sim.run --list                                            # tasks and policies there are
@@ -24,15 +26,35 @@ Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 
 def _execute(config: RunConfig) -> int:
     from osel_sim.api.run import run
+    from osel_sim.cli.causes import print_causes
     from osel_sim.cli.console import console, run_table
 
     result = run(config)
     if result.journal:
         console().print(run_table(dict(result.summary)))
-        for decision in [decision for decision in result.journal if decision.error][:3]:
-            print(f"error in episode {decision.index}: {shown(decision.error or '')}", file=sys.stderr)
-        print(f"written to {result.folder}" + ("; report.html shows it" if result.page else ""))
+        print_causes((decision.policy, f"decision {decision.index}", decision.error) for decision in result.journal if decision.error)
+        print(f"written to {result.folder}" + (f"; {result.page} shows it" if result.page else ""))
+    _print_next(config, result)
     return INTERRUPTED if result.interrupted else 0
+
+
+def _print_next(config: RunConfig, result: "RunResult") -> None:
+    from osel_sim.cli.next_step import Step, print_next
+    from osel_sim.formats.run_config import RUN
+    from osel_sim.selection.registry import RECOMMENDED, is_recommended
+
+    folder, steps = result.folder, list[Step]()
+    if result.interrupted:
+        steps.append(("goes on with it", "run", ["--config", folder / RUN, "--resume"]))
+    elif result.journal:
+        steps.append(("shows its page", "report", [folder, "--open"]))
+        steps.append(("estimates what other choices would have earned", "replay", [folder]))
+    if result.journal and not is_recommended(config.selector):
+        other = folder.with_name(f"{folder.name}-{RECOMMENDED}")
+        steps.append(
+            ("the same instances with the selector we recommend", "run", ["--config", folder / RUN, "--selector", RECOMMENDED, "--out", other])
+        )
+    print_next(*steps)
 
 
 def _list(given: Mapping[str, Any]) -> int:

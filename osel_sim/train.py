@@ -21,17 +21,25 @@ ENCODER_EXAMPLES = """examples:
 
 def _execute(config: TrainConfig) -> int:
     from osel_sim.api.train import train
+    from osel_sim.cli.next_step import print_next
 
     out, result = train(config)
-    print(f"{out}: {result['steps']} steps in {result['training_seconds'] / 60:.1f} minutes")
+    print(f"written to {out}: {result['steps']} steps in {result['training_seconds'] / 60:.1f} minutes")
+    print(
+        f"to drive with it, copy policies/{config.policy}.toml and say checkpoint = {json.dumps(str(out.resolve()))} in the copy (docs/policies.md)"
+    )
+    print_next(("shows what it sees and does", "doctor", ["--policy", "COPY.toml", "--task", result["datasets"][0]["task"]]))
     return 0
 
 
 def _execute_encoder(config: EncoderTrainConfig) -> int:
     from osel_sim.api.train import train_encoder
+    from osel_sim.cli.next_step import print_next
 
-    _, result = train_encoder(config)
+    out, result = train_encoder(config)
     print(json.dumps(result["measured"], indent=2))
+    print(f"written to {out}", file=sys.stderr)  # standard output is JSON
+    print_next(("uses it", "run", ["--task", *config.task, "--encoder", out]), file=sys.stderr)
     return 0
 
 

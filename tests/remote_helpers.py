@@ -89,6 +89,15 @@ def install_plugin(folder: Path) -> None:
         "    return Sinusoid\n"
         "def load_broken(spec, environment):\n"
         "    raise RuntimeError('the weights are on holiday')\n"
+        "def load_chatty(spec, environment):\n"
+        '    print(\'{"url": "ws://127.0.0.1:1"}\', flush=True)\n'
+        "    os.write(1, b'loading ' * 20_000 + b'\\n')\n"
+        "    if spec.kind == 'chatty_broken':\n"
+        "        load_broken(spec, environment)\n"
+        "    return Sinusoid\n"
+        "def load_loud(spec, environment):\n"
+        "    print('loading')\n"
+        "    return Sinusoid\n"
         "class Stuck(Sinusoid):\n"
         "    def act(self, observation):\n"
         "        if observation['task'] == 'wait':\n"
@@ -102,6 +111,7 @@ def install_plugin(folder: Path) -> None:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-policies\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
         "[osel_sim.policies]\nsinusoid = toy_policies:load\nbroken = toy_policies:load_broken\n"
+        "chatty = toy_policies:load_chatty\nloud = toy_policies:load_loud\nchatty_broken = toy_policies:load_chatty\n"
         "stuck = toy_policies:load_stuck\nmissing = toy_policies:none\n"
     )
 

@@ -14,7 +14,7 @@ from osel_sim.analysis.streams import complete_instances
 from osel_sim.context.cache import ContextCache
 from osel_sim.formats.journal import Decision, Lines
 from osel_sim.formats.replay_result import Choices, write_replay
-from osel_sim.interface.outcome import Seconds
+from osel_sim.interface.outcome import Outcome, Seconds
 from osel_sim.selection.reward import RewardWeights, reward
 
 EVIL = "</script><script>window.pwned = 1</script><img src=x onerror='window.pwned = 1'> $x_1$ & <b>bold</b>"
@@ -94,7 +94,9 @@ def made_run(folder: Path, decisions: int = 40, counterfactual: bool = True) -> 
         value = None if decision.error else reward(decision.outcome, WEIGHTS)
         journal.append(asdict(decision) | {"reward": value})
         if others is not None:
-            row = {name: {**other, "seconds": vars(other["seconds"]), "reward": 0.0} for name, other in outcomes.items()}
+            row = {
+                name: {**other, "seconds": vars(other["seconds"]), "reward": reward(Outcome(**other), WEIGHTS)} for name, other in outcomes.items()
+            }
             others.append({"index": index, "policies": row})
     cache.save()
     for lines in (journal, others):

@@ -2,12 +2,15 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
+from osel_sim.cli.command import Command
 from osel_sim.core import content
 
 PLUGIN = '''
@@ -138,6 +141,22 @@ def execute(world: Path, name: str, *arguments: object, **more: str) -> subproce
     return subprocess.run(
         command(world, name, *arguments), env=environment(world, **more), cwd=world, capture_output=True, text=True, timeout=900, check=False
     )
+
+
+def next_commands(output: str) -> list[tuple[str, object]]:
+    """Name and configuration of each command that an output says to type next; their flags exist, and so do their folders."""
+    found = []
+    for line in output[output.rindex("next: ") :].splitlines():
+        words = shlex.split(line.removeprefix("next: "), comments=True)
+        name = words[words.index("-m") + 1].removeprefix("osel_sim.")
+        command = import_module(f"osel_sim.{name}").main
+
+        def keep(config: object, name: str = name) -> int:
+            found.append((name, config))
+            return 0
+
+        assert Command(name, command.config, keep, "")(words[words.index("-m") + 2 :]) == 0, line
+    return found
 
 
 def wait_for_lines(process: subprocess.Popen, file: Path, lines: int) -> None:

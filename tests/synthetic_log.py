@@ -35,7 +35,7 @@ class Synthetic:
 
 def make_row(instance: str, policy: str, repeat: int = 0, success: bool = True, **values) -> Row:
     """A row of a log; what is not given is plain."""
-    plain = {"task": "made_up", "seed": 0, "level": 0, "split": "test", "instruction": "do it", "phrasing": "p-0", "target": "", "container": ""}
+    plain = {"task": "made_up", "seed": None, "level": 0, "split": "test", "instruction": "do it", "phrasing": "p-0", "target": "", "container": ""}
     plain |= {"subgoals": float(success), "steps": 20, "upload": 0.0, "inference": 0.0, "download": 0.0, "motion": 1.0, "calls": 1, "actions": 20}
     plain |= {"price": 0.0, "fallback": None, "error": None}
     return Row(**{**plain, "instance": instance, "policy": policy, "repeat": repeat, "success": success, **values})

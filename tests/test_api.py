@@ -59,11 +59,10 @@ def test_importing_the_package_imports_nothing_heavy():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "set()"
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_log_is_replayed_to_a_selector_of_ones_own(log, workers, tmp_path, capsys):
+def test_a_log_is_replayed_to_a_selector_of_ones_own(log, tmp_path, capsys):
     free = {"alpha_time": 0, "alpha_price": 0, "no_frontier": True}
     told = []
-    result = osel.replay(log, selectors=["ucb1", Greedy], seeds=3, workers=workers, out=tmp_path / "out", on_result=told.append, **free)
+    result = osel.replay(log, selectors=["ucb1", Greedy], seeds=3, workers=2, out=tmp_path / "out", on_result=told.append, **free)
     assert {"ucb1", "Greedy"} <= set(result.selectors["selector"]) and told[0].verdict == result.verdict != ""
     assert capsys.readouterr().out == ""  # only the progress bar, on standard error
     again = osel.replay(log, selectors=[Greedy], seeds=3, workers=1, out=tmp_path / "again", **free)
@@ -82,7 +81,7 @@ def test_a_live_run_of_objects_of_ones_own(tmp_path, capsys):
         osel.as_policy(Hold(), "calm", image_size=32, price_per_action=0.1),
     ]
     settings = {"task": "short", "tasks": world / "tasks", "policies": policies, "selector": Greedy, "out": tmp_path / "run"}
-    osel.run(**settings, episodes=1)
+    osel.run(**settings, episodes=1, no_page=True)
     with pytest.raises(osel.OselError, match="episodes was 1 at the beginning"):
         osel.run(**settings, episodes=2, resume=True)
     result = osel.run(**{**settings, "out": tmp_path / "two"}, episodes=2, seed=1)

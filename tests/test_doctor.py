@@ -8,8 +8,8 @@ import pytest
 from safetensors.numpy import save_file
 
 from osel_sim.cli import machine_checks
+from osel_sim.cli.machine_checks import Check
 from osel_sim.core import content
-from osel_sim.doctor import Check
 
 
 def checkpoint(folder: Path) -> Path:
@@ -92,4 +92,6 @@ def test_the_table_says_what_to_do(tmp_path: Path) -> None:
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 1
     assert "correct mine.toml" in done.stdout
-    assert "missing" in done.stdout.splitlines()[-1]
+    *_, summary, following = done.stdout.splitlines()
+    assert "missing" in summary
+    assert f"-m osel_sim.doctor --policies-dir {tmp_path} " in following

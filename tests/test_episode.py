@@ -37,8 +37,8 @@ class LoggedEnv(TaskEnv):
 class Numbered:
     """Chunks whose action i of call c is (c, i) / 100 in the last two rotations, so that what was made can be read off."""
 
-    def __init__(self, length=12, fail_at=None, raise_at=None, **seconds):
-        self.length, self.fail_at, self.raise_at, self.seconds = length, fail_at, raise_at, seconds
+    def __init__(self, length=12, fail_at=None, raise_at=None, reached=True, **seconds):
+        self.length, self.fail_at, self.raise_at, self.reached, self.seconds = length, fail_at, raise_at, reached, seconds
         self.resets = []
 
     def reset(self, instruction, seed):
@@ -50,7 +50,7 @@ class Numbered:
         if self.calls == self.raise_at:
             raise ZeroDivisionError("the policy has\na bug")
         if self.calls == self.fail_at:
-            return Call(None, upload=0.25, failure="deadline")
+            return Call(None, upload=0.25, failure="deadline", sent=self.reached)
         chunk = np.zeros((self.length, 7), np.float32)
         chunk[:, 4], chunk[:, 5], chunk[:, 6] = self.calls / 100, np.arange(self.length) / 100, -1
         return Call(chunk, **{"megabytes": 0.5, **self.seconds})
@@ -209,6 +209,13 @@ def test_a_failed_call_hands_over_to_the_fallback_for_the_rest(env, instance):
     assert outcome.fallback_steps == outcome.steps - 13
     assert outcome.price == pytest.approx(0.02 * 8 + 0.1 * 2 + 0.5 + 0.01 * fallback.calls)
     assert fallback.resets == [(instance.instruction, episode_seed(instance.key, "small", 0))]
+
+
+def test_a_policy_that_is_never_reached_costs_time_and_no_call(env, instance):
+    driver = Driver(spec("large", mode="blocking"), Numbered(fail_at=1, reached=False))
+    outcome = run_episode(env, instance, driver, Driver(spec("small", price=Price()), Numbered()))
+    assert (outcome.calls, outcome.actions, outcome.price, outcome.seconds.upload) == (0, 0, 0.0, 0.25)
+    assert made(env)[:5] == ["-"] * 5
 
 
 def test_a_failed_call_without_fallback_is_an_error(env, instance):

@@ -210,12 +210,12 @@ def test_a_parquet_file_of_more_rows_than_it_can_hold_is_refused(tmp_path: Path)
     import pyarrow
     from pyarrow import parquet
 
+    from osel_sim.core.parquet import read_parquet
     from osel_sim.formats.rollout_log import ROLLOUTS, read_rollouts
-    from osel_sim.ingestion.readers import _parquet
 
     equal = pyarrow.table({"success": pyarrow.repeat(True, 2_000_000)})
     for name in (ROLLOUTS, "table.parquet"):
         parquet.write_table(equal, tmp_path / name, compression="zstd")
-    for read in (lambda: read_rollouts(tmp_path), lambda: list(_parquet(tmp_path / "table.parquet"))):
+    for read in (lambda: read_rollouts(tmp_path), lambda: read_parquet(tmp_path / "table.parquet", ["success"])):
         with pytest.raises(DataError, match=r"claims 2000000 rows, a file of \d+ bytes cannot hold so many"):
             read()

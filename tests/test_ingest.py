@@ -206,7 +206,7 @@ price = 2
     assert (found["cool/t2", "film", 0].steps, found["cool/t2", "film", 0].price) == (200, 2.0)
     log = read_log(tmp_path / "log")
     place = log.keys.index("heat/t1"), log.policies.index("film"), 0
-    assert log.rewards(preset("alfred"))[place] == pytest.approx(1 / 3 - 0.05 * 100 - 0.005 * 2)
+    assert log.rewards(preset("alfred"))[place] == pytest.approx(1 / 3 - 0.05 * np.log10(100) - 0.005 * 2)
     assert (found["cool/t2", "film", 1].error, found["cool/t2", "film", 1].success) == ("simulator died", False)
 
 

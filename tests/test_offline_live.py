@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from osel_sim.analysis.evaluation import evaluate
 from osel_sim.analysis.live import is_live_run, read_live
+from osel_sim.cli.replay_tables import print_off_policy
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
@@ -16,6 +18,9 @@ from osel_sim.formats.journal import Decision, to_line
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.interface.outcome import Outcome, Seconds
 from osel_sim.replay import main as replay_main
+from osel_sim.reporting.off_policy_section import off_policy_table
+from osel_sim.reporting.page import to_html
+from osel_sim.reporting.run_page import run_page
 from osel_sim.selection.reward import RewardWeights
 
 FREE = RewardWeights(0.0, 0.0)
@@ -57,7 +62,8 @@ def make_run(folder: Path, decisions: int = 400, counterfactual: bool = False) -
         reward = None if one.error else float(one.success)
         own = {key: value for key, value in vars(one).items()}
         journal.append(asdict(Decision(**about, propensities={"local": 0.8, "remote": 0.2}, reward=reward, **own)))
-        others.append({"index": index, "policies": {name: {**found[name].to_dict(), "reward": 0.0} for name in found if name != policy}})
+        rewards = {name: None if other.error else float(other.success) for name, other in found.items()}
+        others.append({"index": index, "policies": {name: {**found[name].to_dict(), "reward": rewards[name]} for name in found if name != policy}})
     cache.save()
     (folder / "episodes.jsonl").write_text("".join(to_line(row) for row in journal))
     if counterfactual:
@@ -81,6 +87,35 @@ def test_estimates_from_the_propensities(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "--counterfactual" in printed and "1 decisions that ended in error" in printed
     assert replay_main([str(run), "--out", str(tmp_path / "out")]) == 2
+
+
+def test_an_estimate_that_rests_on_too_few_decisions_is_not_shown(tmp_path, capsys):
+    run = make_run(tmp_path / "run", 100, counterfactual=True)
+    found = evaluate(read_live(run), FREE)
+    entry = found["targets"]["fixed:remote"]
+    assert entry["few"] == ["ips", "snips", "dr"] and entry["ips"] is not None and entry["ips_effective"] < 30
+    log = read_live(run).outcomes
+    assert entry["measured"] == pytest.approx(np.nanmean(log.success[:, list(log.policies).index("remote")]))
+    table = off_policy_table(found)
+    remote = next(row for row in table.rows if row["who"] == "always remote")
+    assert remote["ips"] is remote["snips"] is remote["dr"] is None and remote["measured"] == entry["measured"]
+    assert remote["ips_effective"] == entry["ips_effective"]
+    received = table.rows[0]["measured"]
+    assert [received.low, received.high] == found["run"]["ci95"]
+    print_off_policy(Console(width=200), found)
+    line = next(line for line in capsys.readouterr().out.splitlines() if "fixed:remote" in line)
+    assert all(f" - ({entry[f'{way}_effective']:.0f}) " in line for way in ("ips", "snips", "dr")) and f" {entry['measured']:.3f} " in line
+
+
+def test_a_policy_that_was_never_chosen_is_no_warning(tmp_path, recwarn):
+    folder = make_run(tmp_path / "run", 40)
+    lines = [json.loads(line) for line in (folder / "episodes.jsonl").read_text().splitlines()]
+    for line in lines:
+        line |= {"policy": "local", "success": True, "subgoals": 1.0, "error": None, "reward": 1.0}
+    (folder / "episodes.jsonl").write_text("".join(to_line(line) for line in lines))
+    html = to_html(run_page(folder))
+    assert "What other ways of choosing would have earned" in html
+    assert [str(warning.message) for warning in recwarn if issubclass(warning.category, RuntimeWarning)] == []
 
 
 def test_errors_of_one_policy_do_not_favour_the_other(tmp_path):

@@ -100,7 +100,7 @@ def test_wrong_logs_are_refused(tmp_path: Path):
         read_log(tmp_path)
     with pytest.raises(DataError, match="'i', policy 'a', repeat 0 is there twice"):
         read_log(write_log(tmp_path / "twice", [make_row("i", "a"), make_row("i", "a")], {"i": ONE}))
-    with pytest.raises(DataError, match="'a': price is nan"):
+    with pytest.raises(DataError, match="column 'price', row 1: must be a finite number of 0 or more or null, got nan"):
         read_log(write_log(tmp_path / "nan", [make_row("i", "a", price=float("nan"))], {"i": ONE}))
     with pytest.raises(DataError, match="no context of 1 instances"):
         read_log(write_log(tmp_path / "context", [make_row("i", "a"), make_row("j", "a")], {"i": ONE}))

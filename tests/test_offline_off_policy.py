@@ -60,6 +60,22 @@ def test_nothing_is_said_about_what_could_not_have_been_chosen():
     assert result.unsupported == 0.5 and result.ips is None and result.dr_ci95 is None
     same = estimate([1.0, 0.0], [0, 1], propensities, propensities)
     assert same.ips == same.snips == same.dr == 0.5 and same.effective_decisions == 2.0
+    assert result.few == same.few == ("ips", "snips", "dr")
+
+
+def test_each_estimate_says_on_how_many_decisions_it_rests():
+    """100 decisions, each policy as likely as the other; the second was chosen in 80 of them, and always paid 0.5."""
+    chosen = np.repeat([0, 1], [20, 80])
+    propensities, target = np.full((100, 2), 0.5), np.tile([0.0, 1.0], (100, 1))
+    result = estimate(np.full(100, 0.5), chosen, propensities, target)
+    assert (result.ips, result.snips, result.mean_weight) == pytest.approx((0.8, 0.5, 1.6))  # by so much ips is off, and this is why
+    assert (result.effective_decisions, result.snips_effective, result.dr_effective) == (80.0, 80.0, 80.0)
+    assert result.ips_effective == pytest.approx(100**2 / (80 * 2.0**2)) == 31.25
+    assert result.few == ()
+    rare = estimate(np.full(100, 0.5), chosen, propensities, np.tile([1.0, 0.0], (100, 1)))
+    assert rare.few == ("ips", "snips", "dr") and rare.ips_effective == rare.snips_effective == 20.0
+    never = estimate(np.full(100, 0.5), np.ones(100), propensities, np.tile([1.0, 0.0], (100, 1)))
+    assert never.few == ("ips", "snips", "dr") and never.snips is None and never.ips_effective == 0.0
 
 
 def test_wrong_input():

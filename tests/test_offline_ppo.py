@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from osel_sim.analysis.engine import replay_one
+from osel_sim.selection.ppo import kernel
 from osel_sim.selection.ppo.compiled import FastPPO, supports
 from osel_sim.selection.registry import make_selector
 
@@ -44,7 +45,7 @@ def sb3_weights(selector, hidden: str, output: str) -> np.ndarray:
 
 
 CASES = {
-    "paper": ("ppo", 64, 60, {}),
+    "paper": ("ppo", 64, 40, {}),
     "paper, no limit on the divergence": ("ppo", 16, 60, {"target_kl": None, "layers": (32, 16)}),
     "unclipped gradients": ("ppo", 16, 60, {"max_grad_norm": 1e9, "layers": (32,), "ent_coef": 0.2}),
     "rollouts that are no multiple of five": ("ppo", 16, 100, {"n_steps": 13, "batch_size": 13, "layers": (32, 16), "learning_rate": 3e-3}),
@@ -101,5 +102,6 @@ def test_compiled_afresh_or_from_the_cache_it_is_the_same_to_the_bit(tmp_path):
 def test_it_learns():
     contexts, rewards = problem(3000, 16, seed=4)
     chosen = replay_one("ppo_tuned", contexts, rewards, POLICIES, 0)
+    assert len(kernel.train.signatures) == len(kernel.forward.signatures) == 1  # what `prepare` compiles is what is used
     late = rewards[np.arange(2000, 3000), chosen[2000:]].mean()
     assert late > rewards[2000:].mean(axis=0).max() + 0.1

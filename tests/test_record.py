@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from remote_helpers import alive
-from run_helpers import HORIZON, children, command, environment, execute, make_world, wait_for_lines, wait_until
+from run_helpers import HORIZON, children, command, environment, execute, make_world, next_commands, wait_for_lines, wait_until
 
 from osel_sim.analysis.log import read_log
+from osel_sim.api.report import report
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.files import digest
 from osel_sim.episodes.workers import Plan
@@ -47,10 +48,14 @@ def files(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in ("rollouts.parquet", "contexts.npz")}
 
 
+def resumed(world: Path, folder: Path, *flags: object) -> list[str]:
+    """Arguments of `record --resume` with the settings of the folder and these flags."""
+    return list(map(str, ["--resume", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--out", folder, *flags]))
+
+
 def resume(world: Path, folder: Path, *flags: object) -> subprocess.CompletedProcess[str]:
-    """`record --resume` with the settings of the folder and these flags."""
-    places = ["--resume", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--out", folder]
-    arguments = [*command(world, "record")[:3], *map(str, [*places, *flags])]
+    """`record --resume` with the settings of the folder and these flags, in a process of its own."""
+    arguments = [*command(world, "record")[:3], *resumed(world, folder, *flags)]
     return subprocess.run(arguments, env=environment(world), capture_output=True, text=True, check=False)
 
 
@@ -78,6 +83,8 @@ def test_every_policy_on_every_instance_from_the_same_state(reference):
     assert len(np.unique(contexts, axis=0)) == INSTANCES
     assert sorted(file.name for file in folder.iterdir()) == ["contexts.npz", "rollouts.parquet", "run.json"]
     assert "episodes an hour" in done.stdout
+    assert f"written to {folder}" in done.stdout
+    assert [name for name, _ in next_commands(done.stdout)] == ["replay", "report", "record"]
     assert "success [95%]" in done.stdout
 
 
@@ -92,6 +99,9 @@ def test_one_worker_killed_with_its_parent_and_resumed_by_two_writes_the_same_by
     process.wait()
     process.stderr.close()
     assert not (folder / "rollouts.parquet").exists()
+    before = (folder / "shards.jsonl").read_bytes()
+    report(folder, out=world / "page")  # as far as it is, and without touching it
+    assert (world / "page" / "report.html").is_file() and (folder / "shards.jsonl").read_bytes() == before
     done = execute(world, "record", *arguments, "--workers", 2, "--resume")
     assert done.returncode == 0, done.stderr
     assert files(folder) == files(reference[0])
@@ -270,7 +280,7 @@ def test_a_recording_killed_while_its_workers_start_leaves_no_process(world):
     process.stderr.close()
 
 
-def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_resume(world, reference):
+def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_resume(world, reference, capsys):
     """The local policy takes its worker along in one of the instances; everything else is as it would have been."""
     whole, _ = read_rollouts(reference[0])
     victim = whole[2 * REPEATS]
@@ -288,18 +298,21 @@ def test_an_episode_on_which_workers_die_is_lost_alone_and_recorded_again_by_a_r
     again = resume(world, world / "dying")
     assert again.returncode == 0 and "lost" not in again.stderr, again.stderr
     assert read_rollouts(world / "dying")[0] == [row for row in whole if row.repeat == 0]
-    assert "is complete" in resume(world, world / "dying").stderr
+    assert record_main(resumed(world, world / "dying")) == 0
+    assert "is complete" in capsys.readouterr().err
 
 
-def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, reference):
+def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, reference, capsys):
     folder = world / "failed"
     shutil.copytree(reference[0], folder)
     rows, metadata = read_rollouts(folder)
     rows[0] = dataclasses.replace(rows[0], success=False, error="PolicyError: the answer is not finite")
     write_rollouts(folder, rows, {key: value for key, value in metadata.items() if key != "schema_version"})
     before = files(folder)
-    done = resume(world, folder)
-    assert done.returncode == 0 and "is complete" in done.stderr and files(folder) == before
+    assert record_main(resumed(world, folder)) == 0
+    shown = capsys.readouterr()
+    assert "is complete" in shown.err and files(folder) == before
+    assert "1 episode of calm ended in an error, in short/test/0/40: PolicyError: the answer is not finite" in shown.out
 
 
 def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):

@@ -151,6 +151,34 @@ def test_a_lying_server(reply, reason):
         assert client.connected
 
 
+@pytest.mark.parametrize(
+    ("extra", "reason"),
+    [
+        (pack({"actions": GOOD}), "sent a message that nobody asked for"),
+        (b"", "sent a message that nobody asked for"),
+        ("Traceback\nCUDA error: out of memory", "reported an error: CUDA error: out of memory"),
+    ],
+)
+@pytest.mark.parametrize("greeting", [None, pack({"model": "pi0"})])
+def test_what_lies_ready_before_a_question_is_no_answer_to_it(extra, reason, greeting):
+    def answer(connection):
+        for message in connection:
+            connection.send(message if RESET in str(unpack(message)) else pack({"actions": GOOD}))
+            connection.send(extra)
+
+    with serving_with(answer, greeting) as url, RemoteClient(url, ENVIRONMENT, timeout=2) as client:
+        client.act(observation())
+        time.sleep(0.2)
+        with raises_soon(reason):
+            client.act(observation())
+        assert not client.connected
+        client.reset("a new connection")
+        time.sleep(0.2)
+        if not client.foreign:  # a server that is not ours was asked nothing yet
+            with raises_soon(reason):
+                client.act(observation())
+
+
 def test_actions_out_of_range_are_clipped():
     def answer(connection):
         for _ in connection:

@@ -18,7 +18,7 @@ from osel_sim.policy.local import LocalCaller
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.codec import pack
 from osel_sim.remote.network import PROFILES, NetworkModel, NetworkProfile
-from osel_sim.remote.policy import RemotePolicy, open_remote
+from osel_sim.remote.policy import RemotePolicy, check_servers, open_remote
 from osel_sim.remote.process import PolicyServerProcess
 
 
@@ -191,8 +191,20 @@ def test_a_server_that_is_gone_fails_calls_not_resets(tmp_path):
     assert "closed the connection" in call.failure and call.seconds == 2.0
     assert "127.0.0.1" not in call.failure  # goes into the journal, where a random port must not be
     remote.reset("x", (2,))
-    assert "Connection refused" in remote.call(observation("x")).failure
+    unreached = remote.call(observation("x"))
+    assert "Connection refused" in unreached.failure and unreached.seconds == 2.0
+    assert call.sent is False and unreached.sent is False
     remote.close()
+
+
+def test_a_question_without_an_answer_was_a_call(tmp_path):
+    with serving_with(lambda connection: connection.recv(timeout=5), pack({"model": "pi0"})) as url:
+        remote = RemotePolicy(policy_spec(tmp_path), RemoteClient(url, ENVIRONMENT, timeout=2))
+        remote.reset("x", (1,))
+        call = remote.call(observation("x"))
+        assert "closed the connection" in call.failure and call.sent
+        assert not remote.call(observation("x")).sent
+        remote.close()
 
 
 def test_a_call_before_any_reset_fails(tmp_path):
@@ -274,6 +286,17 @@ def test_a_server_that_does_not_start_says_why(plugin, kind, reason):
     assert time.monotonic() - start < 30
 
 
+@pytest.mark.parametrize("kind", ["chatty", "chatty_broken"])
+def test_what_a_plugin_prints_while_it_loads_is_not_the_servers_word(plugin, kind):
+    server = PolicyServerProcess(policy_spec(plugin, kind=kind), ENVIRONMENT, timeout=10, start_timeout=60)
+    if kind == "chatty":
+        with server, server.start_client() as client:
+            assert client.act(observation()).actions.shape == (8, 7)
+        return
+    with pytest.raises(RemoteError, match="the weights are on holiday"):
+        server.start()
+
+
 def test_a_server_that_takes_too_long_to_start(plugin):
     server = PolicyServerProcess(policy_spec(plugin), ENVIRONMENT, start_timeout=0.01)
     with pytest.raises(RemoteError, match=r"not ready within 0\.01 s"):
@@ -312,8 +335,10 @@ def test_a_server_of_somebody_else(tmp_path, url, monkeypatch):
     with pytest.raises(RemoteError, match=r"serves Greeting.*expected Greeting"):
         open_remote(policy_spec(tmp_path, name="other", url=url), ENVIRONMENT, timeout=5)
     monkeypatch.delenv("OSEL_SIM_TOKEN")
-    with pytest.raises(RemoteError, match="refused the token"):
-        open_remote(policy_spec(tmp_path, url=url), ENVIRONMENT, timeout=5)
+    for reach in (open_remote, lambda spec, environment, timeout: check_servers([spec], environment, timeout)):
+        with pytest.raises(RemoteError, match=r"policy 'sinusoid' \(.*\): .*: wants a token: put it into the environment variable OSEL_SIM_TOKEN"):
+            reach(policy_spec(tmp_path, url=url), ENVIRONMENT, timeout=5)
+    check_servers([policy_spec(tmp_path)], ENVIRONMENT)  # one that would be started here is not tried
     assert GREETING.policy == "sinusoid"
 
 

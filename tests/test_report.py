@@ -1,12 +1,17 @@
 """The report as files: one page, figures as PNG and SVG, tables as CSV; words from logs stay words."""
 
 import base64
+import contextlib
 import csv
 import io
 import json
+import logging
+import os
 import re
 import shutil
+import subprocess
 import sys
+import warnings
 from dataclasses import replace
 from urllib.parse import unquote
 
@@ -20,7 +25,9 @@ from synthetic_log import make_row, write_log
 
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.log import read_log
-from osel_sim.core.errors import UsageError
+from osel_sim.api.report import report
+from osel_sim.cli.output import show_log
+from osel_sim.core.errors import DataError, UsageError
 from osel_sim.episodes.tensorboard import check_installed
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.report import main as report_main
@@ -113,7 +120,7 @@ def test_robots_are_told_apart_where_there_are_several(log, tmp_path):
     rows, metadata = read_rollouts(log.source)
     assert "robots" not in dict(log_facts(log, WEIGHTS)) and not any(log.labels("robot"))
     shutil.copy(log.source / "contexts.npz", tmp_path)
-    write_rollouts(tmp_path, [replace(row, robot="UR5e") if row.seed % 3 == 1 else row for row in rows], metadata)
+    write_rollouts(tmp_path, [replace(row, seed=None, robot="UR5e") if row.seed % 3 == 1 else row for row in rows], metadata)
     mixed = read_log(tmp_path)
     blocks = {block.name: block for block in policy_blocks(mixed, WEIGHTS)}
     assert "policies_by_robot" in blocks and "policies_by_robot" not in {block.name for block in policy_blocks(log, WEIGHTS)}
@@ -168,12 +175,13 @@ def test_a_replay_whose_log_has_moved(log, tmp_path, capsys):
     assert "are not in this log" in capsys.readouterr().err
     assert not (folder / "report.html").exists()
     assert report_main([str(folder), "--log", str(log.source)]) == 0
-    assert (folder / "report.html").exists()
+    assert (folder / "report.html").exists() and str(folder / "report.html") in capsys.readouterr().out
 
 
 def test_page_of_a_live_run(all_pages):
     _, folder = all_pages["run"]
     page = (folder / "report.html").read_text()
+    assert "The selector we recommend is auto (--selector auto)" in page
     data = embedded(page)
     assert {"routes", "curves", "regret", "success_against_penalty", "propensities", "times"} <= set(data["figures"])
     columns = data["episodes"]["episodes"]
@@ -195,6 +203,45 @@ def test_page_of_a_run_that_knows_only_what_was_chosen(tmp_path):
     assert "regret" not in embedded(page)["figures"]
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("case", ["one decision", "one policy chosen", "one policy always fails", "a log with a policy that always fails"])
+def test_what_is_not_known_is_no_warning(case, tmp_path):
+    if case.startswith("a log"):
+        rows = [
+            make_row(f"t/test/0/{number}", policy, 0, number % 2 == 0, **({"error": "gone"} if policy == "b" else {}))
+            for number in range(12)
+            for policy in ("a", "b", "c")
+        ]
+        write_log(tmp_path, rows, {row.instance: np.arange(4.0) + len(row.instance) for row in rows})
+        with contextlib.suppress(DataError):  # no instance has an outcome of every policy
+            report(tmp_path, alpha_time=0, alpha_price=0)
+        return
+    made_run(tmp_path, decisions=1 if case == "one decision" else 12, counterfactual=case == "one policy always fails")
+    file = tmp_path / "episodes.jsonl"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    kept = [line for line in lines if case != "one policy chosen" or line["policy"] == NEAR]
+    for index, line in enumerate(kept):
+        line["index"] = index
+        if case == "one policy always fails" and line["policy"] == FAR:
+            line |= {"error": "gone", "success": False, "reward": None}
+    file.write_text("".join(json.dumps(line) + "\n" for line in kept))
+    assert "Mean reward" in report(tmp_path).page.read_text()
+
+
+def test_commands_keep_what_libraries_warn_of_to_themselves(capsys):
+    def noisy():
+        warnings.warn("Mean of empty slice", RuntimeWarning, stacklevel=1)
+        logging.getLogger("library").warning("this may change")
+        return subprocess.run([sys.executable, "-c", "import warnings; warnings.warn('from a child')"], capture_output=True, text=True).stderr
+
+    before = warnings.filters[:]
+    with show_log():
+        assert noisy() == ""
+        logging.getLogger("osel_sim.somewhere").warning("of ours")
+    assert capsys.readouterr().err == "warning: of ours\n"
+    assert warnings.filters == before and "PYTHONWARNINGS" not in os.environ
+
+
 def test_videos_are_put_into_the_page_or_linked_from_it(tmp_path, monkeypatch):
     folder = made_run(tmp_path / "run", decisions=3)
     chosen = json.loads((folder / "episodes.jsonl").read_text().splitlines()[1])["policy"]
@@ -214,9 +261,8 @@ def test_videos_are_put_into_the_page_or_linked_from_it(tmp_path, monkeypatch):
     assert "data" not in video and (tmp_path / "elsewhere" / unquote(video["file"])).resolve() == film
 
 
-def test_the_same_input_is_the_same_bytes(log, page_of_log, tmp_path, capsys):
-    assert report_main([str(log.source), "--out", str(tmp_path), "--alpha-time", "0.1", "--alpha-price", "0.01"]) == 0
-    assert str(tmp_path / "report.html") in capsys.readouterr().out
+def test_the_same_input_is_the_same_bytes(all_pages, page_of_log, tmp_path):
+    write_page(all_pages["log"][0], tmp_path)  # made once more, beside the command's
     files = {file.relative_to(page_of_log): file.read_bytes() for file in page_of_log.rglob("*") if file.is_file()}
     assert len(files) > 15
     for name, content in files.items():

@@ -15,6 +15,7 @@ REMOTE = Outcome(True, 0.75, 200, Seconds(upload=1.0, inference=2.0, download=0.
 def test_by_hand():
     assert reward(REMOTE, RewardWeights(0.2, 0.01)) == pytest.approx(1 - 0.2 * math.log10(10.0) - 0.01 * 8)
     assert reward(REMOTE, RewardWeights(0.001, 0.01, "steps")) == pytest.approx(1 - 0.2 - 0.08)
+    assert reward(REMOTE, RewardWeights(0.1, 0.01, "log10-steps")) == pytest.approx(1 - 0.1 * math.log10(200) - 0.08)
     assert reward(REMOTE, RewardWeights(0.0, 0.0, success="subgoals")) == 0.75
     assert reward(replace(REMOTE, success=False), RewardWeights(0.0, 0.0)) == 0.0
 
@@ -27,6 +28,11 @@ def test_waiting_is_not_counted_twice():
 def test_no_time_at_all_counts_as_one_control_step():
     nothing = replace(REMOTE, seconds=Seconds())
     assert reward(nothing, RewardWeights(1.0, 0.0)) == pytest.approx(1 - math.log10(FLOOR_SECONDS))
+    assert reward(replace(nothing, steps=0), RewardWeights(1.0, 0.0, "log10-steps")) == 1.0
+
+
+def test_a_success_pays_by_every_preset():
+    assert all(0.0 < reward(REMOTE, weights) < 1.0 for weights in PRESETS.values())
 
 
 def test_presets_of_the_paper():
@@ -36,7 +42,7 @@ def test_presets_of_the_paper():
         "alfred": (0.05, 0.005),
         "oxe": (0.2, 0.01),
     }
-    assert (PRESETS["alfred"].time_unit, PRESETS["alfred"].success) == ("steps", "subgoals")
+    assert (PRESETS["alfred"].time_unit, PRESETS["alfred"].success) == ("log10-steps", "subgoals")
     assert preset("oxe") is PRESETS["oxe"]
     with pytest.raises(UnknownNameError, match="did you mean 'alfred'"):
         preset("alferd")

@@ -167,7 +167,7 @@ def changed(folder, **columns):
         ("target", [["a"], [], []], "column 'target' must hold text, its type is list"),
         ("policy", ["a", None, "c"], "column 'policy', row 2: is empty, every row needs one"),
         ("repeat", pyarrow.nulls(3), "column 'repeat', row 1: is empty, every row needs one"),
-        ("repeat", [0, 0, -1], "column 'repeat', row 3: must be 0 or more"),
+        ("repeat", [0, 0, -1], "column 'repeat', row 3: must be an integer of 0 or more, got -1"),
         ("success", [True, None, None], "column 'success', row 2: is empty, and error does not say why"),
         ("success", pyarrow.nulls(3), "column 'success', row 1: is empty, and error does not say why"),
     ],
@@ -242,17 +242,17 @@ def test_reward_of_logged_rows_by_hand():
 def test_shards_come_back_and_a_torn_one_is_dropped(tmp_path):
     shards = Shards(tmp_path)
     context = np.linspace(-1, 1, 7, dtype=np.float32) / 3
-    shards.add(5, [row(5), row(5, "large")], "e@1", context)
-    shards.add(4, [row(4)], "e@1", None)
+    shards.add(row(5).instance, [row(5), row(5, "large")], "e@1", context)
+    shards.add(row(4).instance, [row(4)], "e@1", None)
     shards.close(remove=False)
     file = tmp_path / SHARDS
     file.write_bytes(file.read_bytes() + b'{"seed": 6, "rows": [')
     again = Shards(tmp_path)
-    assert again.rows == {5: {("small", 0): row(5), ("large", 0): row(5, "large")}, 4: {("small", 0): row(4)}}
+    assert again.rows == {row(5).instance: {("small", 0): row(5), ("large", 0): row(5, "large")}, row(4).instance: {("small", 0): row(4)}}
     assert list(again.contexts) == ["e@1"]
-    assert list(again.contexts["e@1"]) == [5]
-    assert np.array_equal(again.contexts["e@1"][5], context)
-    assert again.contexts["e@1"][5].dtype == np.float32
+    assert list(again.contexts["e@1"]) == [row(5).instance]
+    assert np.array_equal(again.contexts["e@1"][row(5).instance], context)
+    assert again.contexts["e@1"][row(5).instance].dtype == np.float32
     again.close(remove=True)
     assert not file.exists()
 

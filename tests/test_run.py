@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_helpers import HORIZON, command, environment, execute, make_world, wait_for_lines
+from remote_helpers import alive
+from run_helpers import HORIZON, children, command, environment, execute, make_world, next_commands, wait_for_lines, wait_until
 from synthetic_log import make_row, write_log
 
 from osel_sim.analysis.live import read_live
 from osel_sim.formats.journal import read_journal
+from osel_sim.reporting.run_page import run_page
 from osel_sim.run import main as run_main
 from osel_sim.selection.state import load_state
 
@@ -50,6 +52,8 @@ def test_what_a_run_writes_and_prints(world, reference):
     assert sorted(file.name for file in folder.iterdir()) == sorted(f"{files} {page}".split())
     assert "mean reward" in done.stdout
     assert "hindsight oracle" in done.stdout
+    assert "--selector auto" in done.stdout
+    assert [name for name, _ in next_commands(done.stdout)] == ["report", "replay", "run"]
     assert "Traceback" not in done.stderr
     decisions = read_journal(folder / "episodes.jsonl")
     assert [decision.seed for decision in decisions] == list(range(EPISODES))
@@ -96,18 +100,22 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
     folder = world / f"killed-{trial}"
     arguments = ["--episodes", EPISODES, "--counterfactual", "--out", folder]
     for attempt in range(1 + trial):
-        flags = [*(["--resume"] if attempt else []), *(["--video", "2"] if attempt == 0 else [])]
+        flags = [*(["--resume"] if attempt else []), *(["--video", "2", "--view"] if attempt == 0 else [])]
         process = subprocess.Popen(
             command(world, "run", *arguments, *flags), env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         )
         wait_for_lines(process, folder / "episodes.jsonl", 1 + attempt + chance.randrange(3 - trial))
         time.sleep(chance.random() * 0.15)  # about a decision: somewhere in the next one
+        started = children(process)
         process.send_signal(signal.SIGKILL)
         process.wait()
         process.stderr.close()
+        assert wait_until(lambda started=started: not any(map(alive, started)), 20)  # what shows the run among them
+    assert run_page(folder).title.endswith(f" over {len(read_journal(folder / 'episodes.jsonl'))} decisions")
     assert len(read_journal(folder / "episodes.jsonl")) < EPISODES
-    done = execute(world, "run", *arguments, "--resume")
+    done = execute(world, "run", *arguments, "--resume", "--no-page")
     assert done.returncode == 0, done.stderr
+    assert not (folder / "report.html").exists()
     assert bytes_of(folder) == bytes_of(reference[0])
 
 
@@ -116,7 +124,7 @@ def test_noise_on_actions_reaches_the_robot(tmp_path):
     for noise in ("0", "0.1"):
         folder = tmp_path / noise
         what = ["--task", "close_drawer", "--policies", "scripted_expert", "--selector", "random", "--episodes", "3"]
-        assert run_main([*what, "--action-noise", noise, "--out", str(folder)]) == 0
+        assert run_main([*what, "--action-noise", noise, "--no-page", "--out", str(folder)]) == 0
         lengths.append([decision.steps for decision in read_journal(folder / "episodes.jsonl")])
     assert lengths[0] != lengths[1]
 
@@ -128,7 +136,7 @@ def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world):
     rows = [make_row(key, policy, success=bool(chance.random() < rate)) for key in keys for policy, rate in rates.items()]
     log = write_log(world / "log", rows, {key: chance.normal(size=53).astype(np.float32) for key in keys}, encoder="colours")
     out = world / "warm"
-    flags = ["--selector", "auto", "--episodes", 4, "--out", out]
+    flags = ["--selector", "auto", "--episodes", 4, "--no-page", "--out", out]
     done = execute(world, "run", *flags, "--warm-start", log)
     assert done.returncode == 0, done.stderr
     assert f"shown beforehand: 72 outcomes of 36 instances of {log}, none of them of this run" in done.stderr
@@ -144,7 +152,7 @@ def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world):
 
 def test_ctrl_c_ends_with_what_there_is(world):
     folder = world / "interrupted"
-    arguments = command(world, "run", "--episodes", 500, "--out", folder, "--selector", "random")
+    arguments = command(world, "run", "--episodes", 500, "--out", folder, "--selector", "random", "--no-page")
     process = subprocess.Popen(arguments, env=environment(world), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     wait_for_lines(process, folder / "episodes.jsonl", 2)
     process.send_signal(signal.SIGINT)
@@ -154,6 +162,8 @@ def test_ctrl_c_ends_with_what_there_is(world):
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["decisions"] == len(read_journal(folder / "episodes.jsonl")) >= 2
     assert "random" in output
+    (name, config), *_ = next_commands(output)  # goes on with it
+    assert name == "run" and config.resume and config.folder == folder and config.episodes == 500
 
 
 def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):

@@ -30,6 +30,17 @@ def test_checkers():
     check_env_sb3(environment())
 
 
+@pytest.mark.parametrize("action", [2, -1, 1.0, True, np.True_, "local", None, [1], np.array([1])])
+def test_an_action_that_is_no_policy_is_refused(action):
+    env = environment()
+    env.reset(seed=0)
+    with pytest.raises(UsageError, match=r"an action must be the index of a policy, an integer in \[0, 1\], got"):
+        env.step(action)
+    assert env.step(np.array(1))[4] == {"policy": "remote"}
+    with pytest.raises(UsageError, match="unknown option of reset 'level'"):
+        env.reset(options={"level": 1})
+
+
 def test_one_decision_an_episode():
     contexts, rewards = table()
     env = SelectionEnv(table_rounds(contexts, rewards, in_order=True), POLICIES, 5)

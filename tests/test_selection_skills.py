@@ -86,7 +86,7 @@ def test_true_skills_spare_the_beginning_and_false_ones_are_overruled():
         for name, told in (("true", true), ("false", false), ("none", None))
     }
     assert runs["true"][:40].mean() > 0.72 > runs["none"][:40].mean()
-    assert runs["false"][:10].mean() < 0.45
+    assert runs["false"][:10].mean() < 0.6
     assert min(run[-100:].mean() for run in runs.values()) > 0.7
 
 

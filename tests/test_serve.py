@@ -70,7 +70,13 @@ def test_serves_our_client_and_openpis_and_stops_when_told(folder, number, code)
             assert client.act(observation("x")).actions.shape == (8, 7)
             server.process.send_signal(number)
             assert server.process.wait(10) == code
-        assert server.process.stderr.read() == ""
+        assert re.fullmatch(r"loading sinusoid; clients .* with the token in OSEL_SIM_TOKEN \.\.\.\n", server.process.stderr.read())
+
+
+def test_what_a_plugin_prints_does_not_come_before_the_line(folder):
+    policy_spec(folder, name="loud", kind="loud")
+    with Serving(folder, "loud", OSEL_SIM_TOKEN=TOKEN) as server:
+        assert server.ready["policy"] == "loud"
 
 
 def test_makes_a_token_of_its_own_on_loopback(folder):
@@ -125,7 +131,7 @@ def test_wrong_input_gets_one_line_and_exit_code_2(folder, arguments, complaint)
 def test_a_used_port(folder):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         result = run(folder, "sinusoid", "--policies-dir", str(folder), "--port", str(listener.getsockname()[1]))
-    assert result.returncode == 2 and "cannot listen on 127.0.0.1:" in result.stderr and "Traceback" not in result.stderr
+    assert result.returncode == 2 and result.stderr.startswith("error: cannot listen on 127.0.0.1:")  # before anything is loaded
 
 
 def test_help_comes_fast_and_imports_nothing_heavy(folder):

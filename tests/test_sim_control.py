@@ -9,6 +9,7 @@ robosuite = quiet_robosuite()
 
 import mujoco  # noqa: E402 (after the backend is chosen)
 
+from osel_sim.sim import osc  # noqa: E402
 from osel_sim.sim.control import Control  # noqa: E402
 from osel_sim.sim.robots import BUILT_IN, load_robot  # noqa: E402
 
@@ -85,6 +86,7 @@ def test_trajectory_equals_robosuites_over_200_random_actions(stock, robot, seed
         assert np.abs(data.qpos[:joints] - stock.sim.data.qpos[:joints]).max() < 1e-6
         np.testing.assert_allclose(data.ctrl[robot.joints :], stock.sim.data.ctrl[robot.joints :], rtol=0, atol=1e-12)
     assert np.abs(data.qpos[: robot.joints] - control._initial_joint).max() > 0.01  # it did move
+    assert len(osc.goal_pose.signatures) == len(osc.osc_torques.signatures) == 1  # what `prepare` compiles is what is used
 
 
 def test_actions_beyond_the_range_are_clipped(stock, robot):

@@ -8,6 +8,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+from osel_sim.core import content
+from osel_sim.core.errors import UsageError
+from osel_sim.formats.task_file import load_task_file
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.expert import Expert
 from osel_sim.sim.instance import make_instance
@@ -41,6 +44,74 @@ def test_passes_the_checkers_of_gymnasium_and_sb3():
     gymnasium_check_env(made.unwrapped, skip_render_check=True)
     sb3_check_env(made.unwrapped)
     made.close()
+
+
+@pytest.mark.parametrize(
+    "action",
+    [np.zeros(6), np.zeros((1, 7)), np.zeros(8), 0.0, None, "up", [0.0] * 6 + ["open"], [[0.0], [0.0, 1.0]], np.zeros(7, bool), np.zeros(7, complex)],
+)
+def test_an_action_of_another_shape_or_type_is_refused(env, action):
+    env.reset(seed=0)
+    with pytest.raises(UsageError, match=r"an action must be 7 real numbers of shape \(7,\), got"):
+        env.step(action)
+    assert env.steps == 0
+
+
+def test_an_action_of_no_numbers_is_refused_and_a_large_one_is_clipped(env):
+    for value in (np.nan, np.inf, -np.inf):
+        env.reset(seed=0)
+        with pytest.raises(UsageError, match="an action must be finite numbers"):
+            env.step([0.0] * 6 + [value])
+        assert env.steps == 0 and np.isfinite(env.world.data.qpos).all()
+    states = []
+    for size in (1.0, 50.0):
+        env.reset(seed=0)
+        states.append(env.step([size] * 6 + [-size])[0]["observation.state"])
+    np.testing.assert_array_equal(*states)
+
+
+def test_reset_takes_options_for_one_episode_and_no_others(env):
+    _, drawn = env.reset(seed=4)
+    assert env.reset(seed=4)[1] == drawn and env.instance.level == 0
+    _, info = env.reset(options={"seed": np.int64(7), "level": 2, "split": "test"})
+    assert info["instance"] == "pick_place/test/2/7" and env.instance == make_instance(env.task, 7, 2, "test")
+    _, info = env.reset(options={"seed": 7, "axes": {"camera": 1}})
+    assert info["instance"] == make_instance(env.task, 7, 0, "train", {"camera": 1}).key
+    assert env.reset(seed=4, options={})[1] == drawn
+    assert env.reset(options={"instance": make_instance(env.task, 11)})[1]["instance"] == "pick_place/test/0/11"
+    for options, says in (
+        ({"lvl": 2}, "unknown option of reset 'lvl': did you mean 'level'"),
+        ({"level": 9}, "unknown level 9"),
+        ({"level": "2"}, "level must be an integer, got '2'"),
+        ({"seed": -1}, "a seed must be 0 or more, got -1"),
+        ({"seed": 1.5}, r"seed must be an integer, got 1\.5"),
+        ({"seed": True}, "seed must be an integer, got True"),
+        ({"split": "tests"}, "unknown split 'tests'"),
+        ({"axes": ["camera"]}, "axes must be a mapping"),
+        ({"axes": {"camra": 1}}, "did you mean 'camera'"),
+        ({"instance": "pick_place/test/0/11"}, "instance must be one of 'pick_place'"),
+        ({"instance": make_instance(load_task_file(content.find("tasks", "lift")), 1)}, "instance must be one of 'pick_place' with Panda"),
+        ({"instance": make_instance(env.task, 1), "level": 1}, "an instance has its own level"),
+    ):
+        with pytest.raises(UsageError, match=says):
+            env.reset(options=options)
+    assert env.instance.seed == 11
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"cameras": ("agentvew",)}, "unknown camera 'agentvew': did you mean 'agentview'"),
+        ({"render_mode": "depth"}, "unknown render mode 'depth'"),
+        ({"image_size": 0}, r"image_size must be an integer in \[1, 1024\], got 0"),
+        ({"level": 5}, "unknown level 5"),
+        ({"split": "dev"}, "unknown split 'dev'"),
+        ({"robot": "Pnada"}, "did you mean 'Panda'"),
+    ],
+)
+def test_wrong_settings_are_named(settings, says):
+    with pytest.raises(UsageError, match=says):
+        TaskEnv("lift", **settings)
 
 
 def test_registration_imports_nothing_heavy():

@@ -23,6 +23,26 @@ def test_known_instance_does_not_drift():
     assert instance.key == "pick_place/test/0/0"
 
 
+def test_a_fixed_target_is_always_asked_for_among_distractors_that_change(tmp_path):
+    file = tmp_path / "fetch.toml"
+    text = content.find("tasks", "pick_place").read_text().replace('name = "pick_place"', 'name = "fetch"')
+    file.write_text(text + '\n[fixed]\nobject = "can"\n')
+    task = load_task_file(file)
+    instances = [make_instance(task, seed) for seed in range(60)]
+    assert {instance.target for instance in instances} == {"can"} and len({instance.container for instance in instances}) > 1
+    others = {frozenset(one.entity for one in instance.placements) - {"can"} for instance in instances}
+    assert len(others) > 10 and all("can" in {one.entity for one in instance.placements} for instance in instances)
+    for wrong, complaint in (
+        ('object = "cann"', "fixed.object: unknown value 'cann', did you mean 'can'?"),
+        ('object = "plate"', "fixed.object: unknown value 'plate'"),
+        ('thing = "can"', "fixed.thing: is no role; roles: object, container"),
+    ):
+        file.write_text(f"{text}\n[fixed]\n{wrong}\n")
+        with pytest.raises(ContentError) as refused:
+            load_task_file(file)
+        assert complaint in str(refused.value)
+
+
 def test_splits_are_disjoint_by_construction():
     remainders = {split: {round(make_instance(TASK, seed, split=split).placements[0].x * 1e6) % 3 for seed in range(200)} for split in SPLITS}
     assert remainders == {split: {index} for index, split in enumerate(SPLITS)}

@@ -17,7 +17,7 @@ import torch
 from lerobot.policies.factory import make_pre_post_processors
 from safetensors.torch import load_file
 
-from osel_sim.core.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import CheckpointError, ContentError, DataError, DivergedError, UnknownNameError, UsageError
 from osel_sim.formats import library
 from osel_sim.policy.language_chunk import LanguageChunkPolicy
 from osel_sim.train import main
@@ -68,7 +68,7 @@ def test_demonstrations_are_read_as_they_were_written(demonstrations: Path) -> N
 
 
 def test_a_missing_camera_and_a_wrong_folder_are_named(demonstrations: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="'wrist'; it has: agentview"):
+    with pytest.raises(DataError, match=r"camera 'wrist'.*name one of observation\.images\.agentview with images = .*--map"):
         load_demonstrations(demonstrations, ("wrist",), progress=False)
     with pytest.raises(DataError, match=r"osel_sim\.collect"):
         load_demonstrations(tmp_path, ("agentview",), progress=False)
@@ -258,6 +258,37 @@ def test_measuring_the_speed_changes_nothing_that_is_trained(tmp_path: Path) -> 
     trainer = Trainer(problem, 5, "cpu", tmp_path, {})
     assert trainer.steps_in(0.01) >= 1
     assert all(torch.equal(value, before[name]) for name, value in module.state_dict().items()) and not optimiser.state
+
+
+@pytest.mark.parametrize("where", ["loss", "gradient"])
+def test_a_training_that_diverges_stops_with_the_last_good_weights(tmp_path: Path, where: str) -> None:
+    module = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.BatchNorm1d(2))
+
+    def loss_of(step: int) -> tuple[torch.Tensor, dict[str, float]]:
+        values = module(torch.full((4, 2), float("nan") if step == 3 and where == "loss" else 1.0) * torch.arange(4)[:, None])
+        loss = values.square().mean()
+        if step == 3 and where == "gradient":
+            loss = loss + torch.sqrt(torch.clamp(module[0].weight.sum() * 0, min=0) ** 2)  # finite, with a slope that is not
+        return loss, {"loss": loss.item()}
+
+    problem = Problem(module, lambda step: step, loss_of, torch.optim.SGD(module.parameters(), 0.1), lambda step, steps: 1.0, (), 0.0, 0.5)
+    problem = replace(problem, clipped=tuple(module.parameters()))
+    trainer = Trainer(problem, 10, "cpu", tmp_path, {})
+    with pytest.raises(DivergedError, match=r"step 4 of 10: loss .* keeps the weights of step 3"):
+        trainer.run({}, save_every=100, label="test")
+    again = Trainer(problem, 10, "cpu", tmp_path, {})
+    assert again.resume() and again.progress.step == 3
+    for values in (module.state_dict(), trainer.average):
+        assert all(torch.isfinite(value).all() for value in values.values())
+
+
+def test_a_policy_that_diverges_keeps_a_checkpoint_and_fails(tmp_path: Path, demonstrations: Path) -> None:
+    with pytest.raises(DivergedError):
+        spec = replace(library.load_policy("local_small"), image_size=48)
+        wild = recipe(steps=40, learning_rate=1e6, gradient_clip=0.0)
+        train(spec, wild, [demonstrations], Options(out=tmp_path / "out", threads=1))
+    weights = load_file(tmp_path / "out" / "model.safetensors")
+    assert all(torch.isfinite(value).all() for value in weights.values())
 
 
 @pytest.mark.slow

@@ -12,7 +12,8 @@ import pytest
 
 from osel_sim.context import open_clip_encoder
 from osel_sim.context.encoder import load_encoder
-from osel_sim.context.open_clip_encoder import VOCABULARY, embedded_encoders
+from osel_sim.context.names import embedded_encoders
+from osel_sim.context.open_clip_encoder import VOCABULARY
 from osel_sim.context.sentence_files import check_sentence_model
 from osel_sim.core.errors import CheckpointError
 from osel_sim.core.trust import VARIABLE, ForeignCodeError

@@ -16,6 +16,7 @@ from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
 from osel_sim.interface.selector import SelectorFactory
+from osel_sim.selection.ppo.compiled import prepare
 from osel_sim.selection.reward import RewardWeights
 
 WARM = ":warm"
@@ -75,7 +76,7 @@ def replay(
         seeds: of the streams, and of the selectors.
         decisions: length of a stream; None: all instances.
         workers: processes; with 1 it happens in this one.
-        progress: called with a number of decisions made.
+        progress: called with a number of decisions made; with 0 when the first worker begins.
         factories: selector -> what makes it, where it is none of the registry's.
 
     Raises:
@@ -88,11 +89,13 @@ def replay(
     streams = tuple(draw_streams(table, seeds, decisions) for table in tables)
     material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams, factories or {})
     jobs = [(at, name, number) for name in sorted(selectors, key=_slowness) for at in range(len(setups)) for number in range(len(seeds))]
-    chosen = [{name: np.zeros(own.order.shape, np.int8) for name in selectors} for own in streams]
-    for (at, name, number), columns in _run(material, jobs, workers):
+    chosen = [{name: np.zeros(own.order.shape, np.int16) for name in selectors} for own in streams]
+    if {"ppo", "ppo_tuned"} & set(selectors):
+        prepare()  # here, once, rather than in every worker
+    count = progress or (lambda decisions: None)
+    for (at, name, number), columns in _run(material, jobs, workers, lambda: count(0)):
         chosen[at][name][number] = columns
-        if progress is not None:
-            progress(len(columns))
+        count(len(columns))
     return [Choices(log.keys, log.policies, own.order, own.repeats, names) for own, names in zip(streams, chosen, strict=True)]
 
 
@@ -105,7 +108,7 @@ def replay_one(
     warm_start: WarmStart | None = None,
     factory: SelectorFactory | None = None,
     **settings: Any,
-) -> NDArray[np.int8]:
+) -> NDArray[np.int16]:
     """Show one stream to one selector, which sees the reward of its choices only.
 
     Args:
@@ -128,7 +131,7 @@ def replay_one(
     if isinstance(selector, PPOSelector) and supports(selector):
         return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
     column = {policy: index for index, policy in enumerate(policies)}
-    chosen = np.zeros(len(contexts), np.int8)
+    chosen = np.zeros(len(contexts), np.int16)
     for decision, context in enumerate(contexts):
         choice = selector.select(context)
         chosen[decision] = column[choice.policy]
@@ -140,26 +143,27 @@ def _slowness(name: str) -> int:
     return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
 
 
-def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Iterator[tuple[_Job, NDArray[np.int8]]]:
+def _run(material: _Material, jobs: Sequence[_Job], workers: int, ready: Callable[[], None]) -> Iterator[tuple[_Job, NDArray[np.int16]]]:
     if workers == 1:
+        ready()
         with _one_thread():
             for job in jobs:
                 yield _replay_job(material, job)
         return
-    with closing(run_jobs(partial(_replayer, material), jobs, workers)) as events:
+    with closing(run_jobs(partial(_replayer, material), jobs, workers, ready=ready)) as events:
         for event in events:
             if isinstance(event, Lost):
                 raise event.error or WorkerError(f"a worker process of the replay died twice ({event.cause}; out of memory?); try --workers 1")
             yield event.value
 
 
-def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int8]]]:
+def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
     """What a worker does."""
     _limit_threads()
     return lambda job, _: [_replay_job(material, job)]
 
 
-def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int8]]:
+def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int16]]:
     at, name, number = job
     setup, streams = material.setups[at], material.streams[at]
     rewards = streams.rewards(material.rewards[at], number)

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from osel_sim.analysis.estimate import mean_of
 from osel_sim.analysis.live import LiveLog
+from osel_sim.analysis.log import Array
 from osel_sim.analysis.off_policy import estimate, forward_model, greedy
 from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
-from osel_sim.statistics.intervals import bootstrap_mean_interval
 
 
 def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
@@ -18,7 +19,8 @@ def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
 
     Returns:
         run (folder, selector, decisions, errors, mean_reward, ci95), reward, policies, targets: name -> what an
-        `osel_sim.analysis.off_policy.OffPolicyEstimate` holds.
+        `osel_sim.analysis.off_policy.OffPolicyEstimate` holds, with `few` (which estimates rest on too few decisions to be relied upon) and
+        `measured`: where the run has every outcome, what the target would really have come to, else None.
         The targets are `fixed:<policy>`, `random`, and `greedy`: the policy of the highest reward by a linear model of the decisions so far.
 
     Raises:
@@ -37,7 +39,17 @@ def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
     model = forward_model(contexts, rewards, chosen, len(log.policies))
     targets = {f"fixed:{policy}": np.tile(np.eye(len(log.policies))[column], (len(rewards), 1)) for column, policy in enumerate(log.policies)}
     targets |= {"random": np.full_like(propensities, 1.0 / len(log.policies)), "greedy": greedy(model)}
-    found = {name: asdict(estimate(rewards, chosen, propensities, target, model)) for name, target in targets.items()}
+    outcomes = log.mean_rewards(weights)
+    everywhere = np.isfinite(outcomes).all(axis=1).any()
+    found = {}
+    for name, target in targets.items():
+        one = estimate(rewards, chosen, propensities, target, model)
+        measured = None
+        if everywhere:  # else what is known of a target is the decisions in which the run happened to agree
+            fixed = name.startswith("fixed:")
+            measured = _measured(outcomes, np.tile(target[0], (len(log), 1))) if fixed else _measured(outcomes[valid], target)
+        found[name] = {**asdict(one), "few": list(one.few), "measured": measured}
+    received_mean = mean_of(rewards)
     return {
         "run": {
             "folder": str(log.source),
@@ -45,7 +57,7 @@ def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
             "decisions": len(rewards),
             "errors": int((~valid).sum()),
             "mean_reward": float(rewards.mean()),
-            "ci95": list(bootstrap_mean_interval(rewards)),
+            "ci95": [received_mean.low, received_mean.high] if received_mean else None,
         },
         "reward": asdict(weights),
         "policies": list(log.policies),
@@ -53,7 +65,14 @@ def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
     }
 
 
-def _json(value: float | tuple[float, float] | None) -> float | list[float] | None:
+def _measured(outcomes: Array, target: Array) -> float | None:
+    """Mean reward of a target, of rewards (T, P) and its probabilities (T, P): over the decisions in which all that it may choose is known."""
+    terms = np.where(target > 0.0, outcomes, 0.0) * target
+    known = np.isfinite(terms).all(axis=1)
+    return float(terms.sum(axis=1)[known].mean()) if known.any() else None
+
+
+def _json(value: Any) -> Any:
     """An interval as a list; None where it is unbounded."""
     if not isinstance(value, tuple):
         return value

@@ -41,7 +41,7 @@ class Frontier:
 
 def measured(log: LoggedOutcomes, weights: RewardWeights) -> dict[str, Array]:
     """What a frontier shows of every episode, (N, P, R) each: `score` (what the reward counts as success), `seconds` or `steps`, and `price`."""
-    time = {"steps": log.steps} if weights.time_unit == "steps" else {"seconds": log.seconds}
+    time = {"steps": log.steps} if weights.clock == "steps" else {"seconds": log.seconds}
     return {"score": score_of(log, weights), **time, "price": log.price}
 
 

@@ -1,6 +1,7 @@
 """A live run's folder as material for offline evaluation: what was chosen, with which probability, and what came of it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -8,16 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.log import Array, LoggedInstance, LoggedOutcomes, dense, named_robots, read_contexts
+from osel_sim.context.cache import FILE, ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
-from osel_sim.formats.journal import Decision, read_journal, read_lines
-from osel_sim.formats.levels import instance_key, label
+from osel_sim.formats.counterfactual import COUNTERFACTUAL, to_others
+from osel_sim.formats.journal import JOURNAL, SEEDS_PER_RUN, TIMING, Decision, check_beside, read_journal, read_lines
 from osel_sim.formats.rollout_log import ROLLOUTS, Row
-from osel_sim.formats.run_config import RUN
-from osel_sim.interface.outcome import Outcome, Seconds
-from osel_sim.selection.reward import RewardWeights
-
-JOURNAL, COUNTERFACTUAL = "episodes.jsonl", "counterfactual.jsonl"
+from osel_sim.formats.run_config import RUN, read_run
+from osel_sim.formats.summary import SUMMARY
+from osel_sim.formats.toml_types import quoted
+from osel_sim.formats.values import COUNT, NAME, TEXT
+from osel_sim.interface.outcome import Outcome
+from osel_sim.selection.reward import RewardWeights, check_reward, weights_from
 
 ABOUT = ("task", "seed", "level", "axes", "split", "instruction", "phrasing", "target", "container", "robot")
 """What a decision says of its instance."""
@@ -28,6 +31,7 @@ class LiveLog:
     """T decisions, P policies.
 
     Attributes:
+        decisions: (T,) of the journal; none of a log of somebody else's decisions.
         outcomes: one instance a decision, one repeat; NaN for the policies that were not chosen, unless the run was made with `--counterfactual`.
         chosen: (T,) columns.
         propensities: (T, P) with which each policy would have been chosen.
@@ -35,6 +39,7 @@ class LiveLog:
         reward: weights that the run was made with, as `RewardWeights` takes them.
     """
 
+    decisions: tuple[Decision, ...]
     outcomes: LoggedOutcomes
     chosen: NDArray[np.int64]
     propensities: Array
@@ -47,8 +52,8 @@ class LiveLog:
 
 
 def is_live_run(folder: Path) -> bool:
-    """Whether the folder holds a live run's journal and no rollout log."""
-    return (folder / JOURNAL).is_file() and not (folder / ROLLOUTS).is_file()
+    """Whether the folder holds what a live run leaves, and no rollout log."""
+    return any((folder / name).is_file() for name in (JOURNAL, COUNTERFACTUAL)) and not (folder / ROLLOUTS).is_file()
 
 
 def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
@@ -58,51 +63,84 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
         encoder: whose contexts; None: the run's.
 
     Raises:
-        DataError: its files are missing or damaged, it made no decision, or an instance has no context.
+        DataError: its files are missing or damaged, do not fit together, it made no decision, or an instance has no context.
     """
-    configuration = read_json(folder / RUN).get("configuration", {})
-    policies = configuration.get("policies")
-    if not isinstance(policies, list) or not policies or not all(isinstance(name, str) for name in policies):
-        raise DataError(f"{folder / RUN}: configuration.policies must name the policies, got {policies!r}")
-    decisions = read_journal(folder / JOURNAL)
+    configuration = _configuration(folder)
+    policies, weights = configuration["policies"], weights_from(configuration["reward"], f"{folder / RUN}: configuration.reward")
+    journal = read_journal(folder / JOURNAL)
+    for name in (COUNTERFACTUAL, TIMING):
+        check_beside(folder / name, len(journal))
+    decisions = _as_far_as_contexts(folder, journal, encoder or configuration.get("encoder"))
     if not decisions:
         raise DataError(f"{folder / JOURNAL}: the run made no decision")
     for decision in decisions:
-        if decision.policy not in policies or not decision.propensities.get(decision.policy, 0.0) > 0.0:
-            raise DataError(f"{folder / JOURNAL}, line {decision.index + 1}: {decision.policy!r} is no policy of the run, or has no propensity")
+        _check(decision, configuration, weights, f"{folder / JOURNAL}, line {decision.index + 1}")
     instances = named_robots(
-        LoggedInstance(_key(decision), **{name: getattr(decision, name) for name in ABOUT if name != "axes"}) for decision in decisions
+        LoggedInstance(decision.instance, **{name: getattr(decision, name) for name in ABOUT if name != "axes"}) for decision in decisions
     )
     rows = [_row(decision, decision.policy, decision.outcome) for decision in decisions]
-    for number, (data, _) in enumerate(read_lines(folder / COUNTERFACTUAL)):
-        if number < len(decisions):
-            rows += [_row(decisions[number], policy, outcome) for policy, outcome in _others(data, folder, number)]
+    for decision, (data, _) in zip(decisions, read_lines(folder / COUNTERFACTUAL), strict=False):  # a killed run may have one line more
+        others = to_others(data, decision.index, folder / COUNTERFACTUAL, policies, decision.policy)
+        for policy, outcome in others.outcomes.items():
+            check_reward(others.rewards[policy], outcome, weights, f"{folder / COUNTERFACTUAL}, line {decision.index + 1}: {policy}")
+            rows.append(_row(decision, policy, outcome))
+    if (folder / COUNTERFACTUAL).exists() or configuration.get("counterfactual") is True:
+        check_beside(folder / COUNTERFACTUAL, len(decisions), complete=True)
     keys = [instance.key for instance in instances]
     identity, contexts = read_contexts(folder, keys, encoder or configuration.get("encoder"))
     arrays = dense(folder, rows, keys, policies)
     outcomes = LoggedOutcomes(folder, instances, tuple(policies), contexts, identity, **arrays, metadata=configuration, skills=None)
     propensities = np.array([[decision.propensities.get(policy, 0.0) for policy in policies] for decision in decisions], np.float64)
     chosen = np.array([policies.index(decision.policy) for decision in decisions], np.int64)
-    return LiveLog(outcomes, chosen, propensities, str(configuration.get("selector", "unknown")), dict(configuration.get("reward", {})))
+    return LiveLog(tuple(decisions), outcomes, chosen, propensities, str(configuration.get("selector", "unknown")), asdict(weights))
 
 
-def _key(decision: Decision) -> str:
-    return instance_key(decision.task, decision.split, label(decision.level, decision.axes), decision.seed, decision.robot)
+def _as_far_as_contexts(folder: Path, decisions: list[Decision], encoder: str | None) -> list[Decision]:
+    """The decisions without the last few that have no context yet, in a run that goes on or was killed: contexts are written some at a time."""
+    if encoder is None or not (folder / FILE).is_file():
+        return decisions
+    cache = ContextCache(folder)
+    have = [cache.get(encoder, decision.instance) is not None for decision in decisions]
+    known = sum(have)
+    finished = read_json(folder / SUMMARY).get("decisions", 0) if (folder / SUMMARY).is_file() else 0
+    return decisions[:known] if all(have[:known]) and known > 0 and known >= finished else decisions
 
 
-def _others(data: dict[str, Any], folder: Path, number: int) -> list[tuple[str, Outcome]]:
-    """Outcomes of the policies that were not chosen, from one line of `counterfactual.jsonl`."""
-    try:
-        found = []
-        for policy, values in data["policies"].items():
-            own = {key: value for key, value in values.items() if key != "reward"}
-            found.append((str(policy), Outcome(**{**own, "seconds": Seconds(**own["seconds"])})))
-        return found
-    except (KeyError, TypeError, AttributeError) as error:
-        raise DataError(f"{folder / COUNTERFACTUAL}, line {number + 1}: not outcomes of policies ({error})") from None
+def _configuration(folder: Path) -> dict[str, Any]:
+    """The run's configuration, with all that is read of it in the promised form."""
+    configuration: dict[str, Any] = read_run(folder)["configuration"]
+    place = f"{folder / RUN}: configuration"
+    policies = configuration.get("policies")
+    if not isinstance(policies, list) or not policies or not all(map(NAME.fits, policies)) or len(set(policies)) < len(policies):
+        raise DataError(f"{place}.policies must name the policies, got {quoted(policies)}")
+    for key, kind in (("encoder", NAME), ("selector", TEXT), ("split", NAME), ("seed", COUNT)):
+        if key in configuration and not kind.fits(configuration[key]):
+            raise DataError(f"{place}.{key} must be {kind.wanted}, got {quoted(configuration[key])}")
+    tasks = configuration.get("tasks", [])
+    if not isinstance(tasks, list) or not all(map(NAME.fits, tasks)):
+        raise DataError(f"{place}.tasks must name the tasks, got {quoted(tasks)}")
+    if "reward" not in configuration:
+        raise DataError(f"{place}.reward is missing")
+    return configuration
+
+
+def _check(decision: Decision, configuration: Mapping[str, Any], weights: RewardWeights, place: str) -> None:
+    """Refuse a decision that this run cannot have made."""
+    if decision.policy not in configuration["policies"] or not decision.propensities[decision.policy] > 0.0:
+        raise DataError(f"{place}: {decision.policy!r} is no policy of the run, or has no propensity")
+    if unknown := set(decision.propensities) - set(configuration["policies"]):
+        raise DataError(f"{place}: propensities of policies that the run does not have: {quoted(sorted(unknown))}")
+    tasks = configuration.get("tasks")
+    if tasks and decision.task not in tasks:
+        raise DataError(f"{place}: task must be one of the run's ({', '.join(tasks)}), got {decision.task!r}")
+    if (split := configuration.get("split", decision.split)) != decision.split:
+        raise DataError(f"{place}: split must be the run's, {split!r}, got {decision.split!r}")
+    if "seed" in configuration and decision.seed != (seed := configuration["seed"] * SEEDS_PER_RUN + decision.index):
+        raise DataError(f"{place}: seed must be {seed}, the run's for this decision, got {decision.seed}")
+    check_reward(decision.reward, decision.outcome, weights, place)
 
 
 def _row(decision: Decision, policy: str, outcome: Outcome) -> Row:
     own = {key: value for key, value in vars(outcome).items() if key != "seconds"}
     about: dict[str, Any] = {name: getattr(decision, name) for name in ABOUT}
-    return Row(**about, instance=_key(decision), policy=policy, repeat=0, **own, **vars(outcome.seconds))
+    return Row(**about, instance=decision.instance, policy=policy, repeat=0, **own, **vars(outcome.seconds))

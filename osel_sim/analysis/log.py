@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.files import read_json
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts
+from osel_sim.formats.run_config import RUN
+from osel_sim.formats.shards import read_shards
 from osel_sim.interface.outcome import stood_in
 from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.selection.reward import RewardWeights, combined, counted_time, total_seconds
@@ -123,7 +126,7 @@ class LoggedOutcomes:
         ran = np.isfinite(self.success)
         for name, values, weight, remedy in (
             (weights.success, score, 1.0, "choose success instead"),
-            ("times" if weights.time_unit == "log10-seconds" else "steps", time, weights.alpha_time, "give --alpha-time 0"),
+            ("times" if weights.clock == "seconds" else "steps", time, weights.alpha_time, "give --alpha-time 0"),
             ("prices", price, weights.alpha_price, "give --alpha-price 0"),
         ):
             if weight > 0.0 and ran.any() and not np.isfinite(values).any():
@@ -207,17 +210,39 @@ def read_log(folder: Path, encoder: str | None = None) -> LoggedOutcomes:
     rows, metadata = read_rollouts(folder)
     if not rows:
         raise DataError(f"{folder / ROLLOUTS}: the log has no rows")
-    instances: dict[str, LoggedInstance] = {}
-    for row in rows:
-        if row.instance not in instances:
-            instances[row.instance] = _instance(row)
+    instances = tuple(dict.fromkeys(row.instance for row in rows))
+    identity, contexts = read_contexts(folder, instances, encoder or metadata.get("encoder"))
+    return _logged(folder, rows, metadata, identity, contexts, read_skills(folder, identity, metadata.get(DECLARED)))
+
+
+def read_unfinished(folder: Path) -> tuple[LoggedOutcomes, list[Row]]:
+    """What a recording that goes on, or was killed, has so far, and its rows; nothing in the folder is touched.
+
+    Raises:
+        DataError: it has no instance yet, or is damaged.
+    """
+    configuration = read_json(folder / RUN).get("configuration", {})
+    rows, contexts = read_shards(folder)
+    known = contexts.get(configuration.get("encoder", ""), {})
+    found = [row for instance in known for row in rows.get(instance, {}).values()]
+    if not found:
+        raise DataError(f"{folder}: the recording has no instance yet")
+    stacked = np.stack([known[instance] for instance in dict.fromkeys(row.instance for row in found)])
+    return _logged(folder, found, configuration, str(configuration["encoder"]), stacked, None), found
+
+
+def _logged(
+    folder: Path, rows: Sequence[Row], metadata: dict[str, Any], encoder: str, contexts: NDArray[np.float32], skills: Skills | None
+) -> LoggedOutcomes:
+    """Rows as arrays, instances in the order in which they first appear; `contexts` are in that order."""
+    instances = {row.instance: _instance(row) for row in reversed(rows)}
+    keys = tuple(dict.fromkeys(row.instance for row in rows))
     named = metadata.get("policies")
     policies = tuple(dict.fromkeys([*(named if isinstance(named, list) else []), *(row.policy for row in rows)]))
     policies = tuple(name for name in policies if name in {row.policy for row in rows})
-    identity, contexts = read_contexts(folder, tuple(instances), encoder or metadata.get("encoder"))
-    arrays = dense(folder, rows, tuple(instances), policies)
-    skills = read_skills(folder, identity, metadata.get(DECLARED))
-    return LoggedOutcomes(folder, named_robots(instances.values()), policies, contexts, identity, **arrays, metadata=metadata, skills=skills)
+    arrays = dense(folder, rows, keys, policies)
+    robots = named_robots(instances[key] for key in keys)
+    return LoggedOutcomes(folder, robots, policies, contexts, encoder, **arrays, metadata=metadata, skills=skills)
 
 
 def named_robots(instances: Iterable[LoggedInstance]) -> tuple[LoggedInstance, ...]:

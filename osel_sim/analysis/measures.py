@@ -5,9 +5,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from osel_sim.analysis.estimate import Estimate, instance_draws, over_instances
 from osel_sim.analysis.log import Array, LoggedOutcomes
 from osel_sim.analysis.oracles import Oracles
+from osel_sim.analysis.outcomes import overall
 from osel_sim.formats.replay_result import Choices
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.statistics.intervals import RESAMPLES, Interval, bootstrap_mean_interval, bootstrap_means
@@ -87,10 +90,10 @@ def measure_selector(log: LoggedOutcomes, choices: Choices, rewards: Curves, nam
     successes = choices.received(name, log.success)
     return {
         "mean_reward": float(received.mean()),
-        "ci95": list(bootstrap_mean_interval(units(received))),
+        **_with_interval("ci95", over_instances(received, choices.order)),
         "mean_reward_late": float(received[:, late].mean()),
         "success_rate": got["success"],
-        "success_ci95": list(bootstrap_mean_interval(units(successes))) if got["success"] is not None else None,
+        **_with_interval("success_ci95", over_instances(successes, choices.order)),
         "mean_subgoals": got["subgoals"],
         "mean_score": got["score"],
         "mean_steps": got["steps"],
@@ -107,6 +110,26 @@ def measure_selector(log: LoggedOutcomes, choices: Choices, rewards: Curves, nam
         "decisions_until_ahead": until_ahead(received - rewards.oracles["best_single"]),
         "decisions_until_better": until_better(received - rewards.oracles["best_single"]),
     }
+
+
+def measure_fixed(log: LoggedOutcomes, weights: RewardWeights, policy: str) -> dict[str, Any]:
+    """What always one policy comes to: over all repeats of all instances, not those that the streams happened to draw.
+
+    Returns:
+        those of a selector's measures (`measure_selector`) of which a log says more than its streams.
+    """
+    result = next(result for result in overall(log, weights) if result.policy == policy)
+    names = {"success_rate": "success", "mean_subgoals": "subgoals", "mean_score": "score", "mean_steps": "steps", "mean_seconds": "seconds"}
+    means = {key: getattr(result, name) for key, name in (names | {"mean_reward": "reward", "mean_price": "price"}).items()}
+    found = {key: None if mean is None else mean.value for key, mean in means.items()}
+    return found | _with_interval("ci95", result.reward) | _with_interval("success_ci95", result.success)
+
+
+def oracle_interval(rewards: Curves, oracle: str, instances: NDArray[Any]) -> Interval:
+    """95 % bootstrap interval of an oracle's mean reward: over instances (S, T), and what the oracle may be off."""
+    draws = instance_draws(rewards.oracles[oracle].ravel(), instances.ravel(), RESAMPLES) + rewards.errors(oracle)
+    low, high = np.quantile(draws, [0.025, 0.975])
+    return float(low), float(high)
 
 
 def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tuple[float, Interval | None] | None:
@@ -164,6 +187,10 @@ def paired(rewards: Curves, names: Sequence[str]) -> list[dict[str, Any]]:
                 }
             )
     return result
+
+
+def _with_interval(name: str, estimate: Estimate | None) -> dict[str, Any]:
+    return {name: None if estimate is None else [estimate.low, estimate.high]}
 
 
 def _gap_entries(name: str, found: tuple[float, Interval | None] | None) -> dict[str, Any]:

@@ -14,6 +14,12 @@ from osel_sim.analysis.log import Array
 from osel_sim.core.errors import UsageError
 from osel_sim.statistics.intervals import Interval
 
+LEAST_EFFECTIVE = 30.0
+"""Estimates that rest on fewer effective decisions are shown nowhere: normal intervals of so few do not hold, and one lucky choice decides."""
+
+WAYS = ("ips", "snips", "dr")
+"""Fields of `OffPolicyEstimate`, each with its `_ci95` and `_effective`."""
+
 COMPONENTS = 16
 """Directions of the contexts that the reward model looks at."""
 
@@ -32,7 +38,11 @@ class OffPolicyEstimate:
         ips: inverse propensity scoring: unbiased, at the mercy of rare choices.
         snips: the same over the mean weight: slightly biased, steadier.
         dr: doubly robust: a reward model's prediction, corrected by weighted residuals. Unbiased as ips; the better the model, the narrower.
-        effective_decisions: how many decisions made by the target itself would weigh as much.
+        ips_effective, snips_effective, dr_effective: how many decisions made by the target itself would weigh as much. For snips and dr Kish's
+            number of the weights, (sum w)^2 / sum w^2. ips takes the mean weight for the 1 that it is on average; where it came out higher, few
+            decisions count for many, and the number is T^2 / sum w^2 (Elvira, Martino and Robert 2018, "Rethinking the effective sample size").
+        effective_decisions: Kish's number.
+        mean_weight: what ips takes for 1; ips is snips times this.
         unsupported: share of the target's choices that the run could never have made, so that nothing is known of them; the estimates are None
             where it is not 0.
     """
@@ -43,8 +53,17 @@ class OffPolicyEstimate:
     snips_ci95: Interval | None
     dr: float | None
     dr_ci95: Interval | None
+    ips_effective: float
+    snips_effective: float
+    dr_effective: float
     effective_decisions: float
+    mean_weight: float
     unsupported: float
+
+    @property
+    def few(self) -> tuple[str, ...]:
+        """Which of the three rest on too few decisions to be shown (`LEAST_EFFECTIVE`)."""
+        return tuple(way for way in WAYS if getattr(self, f"{way}_effective") < LEAST_EFFECTIVE)
 
 
 def estimate(rewards: ArrayLike, chosen: ArrayLike, propensities: ArrayLike, target: ArrayLike, model: ArrayLike | None = None) -> OffPolicyEstimate:
@@ -77,14 +96,16 @@ def estimate(rewards: ArrayLike, chosen: ArrayLike, propensities: ArrayLike, tar
     unsupported = float(np.where(behaviour > 0.0, 0.0, wanted).sum(axis=1).mean())
     squares = float((weights**2).sum())
     effective = float(weights.sum()) ** 2 / squares if squares > 0.0 else 0.0
+    mean_weight = float(weights.mean())
+    counts = (min(effective, len(weights) ** 2 / squares) if squares > 0.0 else 0.0, effective, effective, effective, mean_weight, unsupported)
     if unsupported > 0.0 or effective == 0.0:
-        return OffPolicyEstimate(None, None, None, None, None, None, effective, unsupported)
+        return OffPolicyEstimate(None, None, None, None, None, None, *counts)
     snips = float((weights * received).sum() / weights.sum())
     dr_terms = (wanted * predicted).sum(axis=1) + weights * (received - predicted[rows, columns])
     ips, ips_interval = _mean(weights * received)
     dr, dr_interval = _mean(dr_terms)
-    _, (low, high) = _mean(weights * (received - snips) / weights.mean())
-    return OffPolicyEstimate(ips, ips_interval, snips, (snips + low, snips + high), dr, dr_interval, effective, unsupported)
+    _, (low, high) = _mean(weights * (received - snips) / mean_weight)
+    return OffPolicyEstimate(ips, ips_interval, snips, (snips + low, snips + high), dr, dr_interval, *counts)
 
 
 def forward_model(contexts: NDArray[np.float32], rewards: Array, chosen: NDArray[np.int64], policies: int) -> Array:

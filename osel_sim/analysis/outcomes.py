@@ -1,5 +1,6 @@
 """What every policy came to on every task (paper, figures 3 and 4), and how often local and remote policies succeed together (table I)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,6 +61,15 @@ class OutcomeRates:
 
 def per_group(log: LoggedOutcomes, weights: RewardWeights, attribute: str = "task") -> list[PolicyResult]:
     """Every policy on all instances, then on each task (or target, phrasing ...) apart where there are several."""
+    return _results(log, weights, groups(log, attribute))
+
+
+def overall(log: LoggedOutcomes, weights: RewardWeights) -> list[PolicyResult]:
+    """Every policy on all instances."""
+    return _results(log, weights, {EVERYTHING: np.ones(len(log), bool)})
+
+
+def _results(log: LoggedOutcomes, weights: RewardWeights, parts: Mapping[str, NDArray[np.bool_]]) -> list[PolicyResult]:
     rewards, seconds = log.rewards(weights), log.seconds
     return [
         PolicyResult(
@@ -73,7 +83,7 @@ def per_group(log: LoggedOutcomes, weights: RewardWeights, attribute: str = "tas
             rate_of(log.success[rows, column]),
             *(mean_of(mean_over_repeats(values[rows, column])) for values in (log.subgoals, log.score, rewards, log.steps, seconds, log.price)),
         )
-        for group, rows in groups(log, attribute).items()
+        for group, rows in parts.items()
         for column, policy in enumerate(log.policies)
     ]
 
@@ -99,9 +109,9 @@ def remote_policies(log: LoggedOutcomes) -> tuple[NDArray[np.bool_], str]:
         remote = (values > 0.0).any(axis=(0, 2))
         if remote.any() and not remote.all():
             return remote, reason
-    rates = np.nanmean(mean_over_repeats(log.success), axis=0)
+    rates = mean_over_repeats(mean_over_repeats(log.success).T)
     remote = np.ones(len(log.policies), bool)
-    remote[int(np.nanargmin(rates))] = False
+    remote[int(np.nan_to_num(rates, nan=np.inf).argmin())] = False  # a policy that was never chosen has no rate
     return remote, "local: the policy with the lowest success, as in the paper, because the log has no network times or prices that tell"
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from osel_sim.analysis.log import LoggedOutcomes
-from osel_sim.analysis.measures import curves, measure_selector, paired
+from osel_sim.analysis.measures import curves, measure_selector, oracle_interval, paired
 from osel_sim.analysis.oracles import Oracles
 from osel_sim.analysis.streams import LeftOut
 from osel_sim.analysis.verdict import reward_span, verdict
@@ -23,8 +23,8 @@ REFERENCES = (BEST, WORST)
 def with_fixed(choices: Choices, best: Oracles) -> Choices:
     """The choices with those of every fixed policy added, and of the best and the worst under names of their own."""
     shape = choices.order.shape
-    fixed = {f"fixed:{policy}": np.full(shape, column, np.int8) for column, policy in enumerate(choices.policies)}
-    singles = {name: np.full(shape, column, np.int8) for name, column in ((BEST, best.best_single), (WORST, best.worst_single))}
+    fixed = {f"fixed:{policy}": np.full(shape, column, np.int16) for column, policy in enumerate(choices.policies)}
+    singles = {name: np.full(shape, column, np.int16) for name, column in ((BEST, best.best_single), (WORST, best.worst_single))}
     return Choices(choices.instances, choices.policies, choices.order, choices.repeats, {**choices.chosen, **singles, **fixed})
 
 
@@ -66,7 +66,7 @@ def build(
         "oracles": {
             name: {
                 "mean_reward": float(values.mean()),
-                "ci95": list(rewards.interval(name, values)),
+                "ci95": list(oracle_interval(rewards, name, choices.order)),
                 "mean_reward_late": float(values[:, rewards.late :].mean()),
             }
             for name, values in rewards.oracles.items()

@@ -1,5 +1,6 @@
 """Outcome tables of others as a rollout log."""
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from osel_sim.api.results import frame
+from osel_sim.api.reward import DEFAULT_PRESET
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Folder, Group, Names, NonNegative, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UsageError
 from osel_sim.core.trust import trusting
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
     from osel_sim.ingestion.columns import Columns
     from osel_sim.selection.reward import RewardWeights
 
-TABLE_FLAGS = ("text", "image", "group", "key", "policy_column", "repeat_column", "duplicates", "name", *VALUES)
+logger = logging.getLogger(__name__)
+
+TABLE_FLAGS = ("text", "image", "group", "key", "policy_column", "repeat_column", "duplicates", "propensity", "price_unit", "name", *VALUES)
 COLUMNS = Group("Columns of the tables, instead of --map (a column's name; numbers hold for every row)", 1)
 DATASET = Group("A LeRobotDataset, with --metric action-mse", 2)
 
@@ -32,14 +36,14 @@ class IngestConfig(TrustSettings):
     out: Annotated[Path | None, MAIN] = None
     """where to write"""
     map: Annotated[Path | None, MAIN] = None
-    """mapping file; it alone says what the columns mean"""
+    """mapping file; it alone says what a table's columns mean, or with action-mse which names and conventions of the datasets are others"""
     files: Annotated[Names | None, MAIN] = None
-    """tables: .csv, .tsv, .jsonl or .parquet; * stands for anything, {NAME} makes a column of it"""
+    """tables: .csv, .tsv, .jsonl, .json or .parquet, or folders of such; * stands for anything, {NAME} makes a column of it"""
     encoder: Annotated[str | None, MAIN] = None
     """tfidf, sentence:MODEL, MODEL:TAG of open_clip, a folder, or with images also A+tfidf and A+sentence:MODEL (default: tfidf, and with images
     osel_small+tfidf)"""
     preset: Annotated[Literal["mmlu", "waymo", "alfred", "oxe"] | None, MAIN] = None
-    """weights of the summary's rewards (default: mmlu, with action-mse oxe)"""
+    """weights of the summary's rewards (default: oxe)"""
     device: Annotated[str, OTHER] = "cpu"
     """torch device of the encoder; on another than cpu the last bits may differ"""
     policies_dir: Annotated[Folder | None, CONTENT] = None
@@ -52,9 +56,9 @@ class IngestConfig(TrustSettings):
     image: Annotated[Names | None, COLUMNS] = None
     """columns with paths of images, relative to the table"""
     group: Annotated[str | None, COLUMNS] = None
-    """what the log calls the task, such as a question's subject"""
+    """what the log calls the task, such as a question's subject: a column, or a template"""
     key: Annotated[str | None, COLUMNS] = None
-    """identifies an instance (default: its text, images and group)"""
+    """identifies an instance: a column, or a template (default: its text, images and group)"""
     policies: Annotated[Names | None, COLUMNS] = None
     """of a wide table, or those a long one may have; with action-mse those to run"""
     policy_column: Annotated[str | None, COLUMNS] = None
@@ -63,8 +67,11 @@ class IngestConfig(TrustSettings):
     """numbers repeats of a policy on an instance from 0 on"""
     duplicates: Annotated[Literal["refuse", "drop", "repeats", "keep"] | None, COLUMNS] = None
     """a second row of the same instance (default: refuse)"""
+    propensity: Annotated[str | None, COLUMNS] = None
+    """with which probability the row's policy was chosen, in a long table whose rows are decisions: logged bandit data"""
     success: Annotated[Names | None, COLUMNS] = None
-    """column of true and false, 1 and 0; here and below: a column, a number, or POLICY=VALUE; {policy} stands for the name"""
+    """column of true and false, yes and no, 1 and 0; here and below: a column (a.b: b within a), a number, a column in another unit (ms/1000), or
+    POLICY=VALUE; {policy} stands for the name"""
     score: Annotated[Names | None, COLUMNS] = None
     """a graded outcome, higher is better"""
     subgoals: Annotated[Names | None, COLUMNS] = None
@@ -82,7 +89,9 @@ class IngestConfig(TrustSettings):
     motion: Annotated[Names | None, COLUMNS] = None
     """seconds"""
     price: Annotated[Names | None, COLUMNS] = None
-    """cents"""
+    """cents, or dollars (--price-unit usd, or a dollar sign in each)"""
+    price_unit: Annotated[Literal["cents", "usd"] | None, COLUMNS] = None
+    """what prices are given in (default: cents, dollars where they have a dollar sign)"""
     error: Annotated[Names | None, COLUMNS] = None
     """why there is no valid outcome; empty where there is one"""
     at_least: Annotated[float | None, COLUMNS] = None
@@ -141,7 +150,7 @@ def ingest(config: IngestConfig | None = None, /, **values: Any) -> IngestResult
         raise SettingError("out", "is missing: give the folder to write to")
     with trusting(config.trust):
         if config.metric == "action-mse":
-            _refuse(config, (*TABLE_FLAGS, "map", "files"), "--metric action-mse")
+            _refuse(config, (*TABLE_FLAGS, "files"), "--metric action-mse")
             return _action_mse(config, config.out)
         _refuse(config, ("dataset", "policies_dir", "camera", "frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
         return _table(config, config.out)
@@ -155,12 +164,15 @@ def _refuse(config: IngestConfig, names: Sequence[str], with_what: str) -> None:
 
 def _table(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.context.encoder import load_log_encoder
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF
     from osel_sim.core.files import file_digest
+    from osel_sim.core.images import load_image
+    from osel_sim.formats.rollout_log import PROPENSITIES
     from osel_sim.ingestion.convert import convert
+    from osel_sim.ingestion.doubts import alike, beyond_reason
     from osel_sim.ingestion.readers import read_tables
-    from osel_sim.ingestion.write import IngestedInstance, check_out, load_image, write_log
+    from osel_sim.ingestion.write import IngestedInstance, check_out, write_log
 
     start = time.perf_counter()
     columns = _columns(config, out)
@@ -179,16 +191,22 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
             )
         )
     inputs = check_out(out, instances)
+    keys = [(source.task, source.key.removeprefix(f"{source.task}/")) for source in converted.sources]
+    doubts = [*alike("groups", ((task,) for task, _ in keys)), *(alike("instances", keys) if columns.key else ())]
+    for doubt in (*doubts, *beyond_reason(converted.rows, columns.from_flags)):
+        logger.warning(doubt)
     notes = [f"{len(records)} rows: {len(instances)} instances, {len(converted.policies)} policies, {len(converted.rows)} outcomes"]
     if converted.dropped:
         notes.append(f"{converted.dropped} duplicate rows left out, {converted.differing or 'none'} of which differed from the row that was kept")
     name = config.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if columns.images else TFIDF)
     files = sorted({record.file for record in records})
-    metadata = {
+    metadata: dict[str, Any] = {
         "task": columns.name,
         "policies": converted.policies,
         "source": {"metric": "table", "files": {file.name: file_digest(file) for file in files}},
     }
+    if converted.propensities is not None:
+        metadata[PROPENSITIES] = converted.propensities
     texts = [item.text for item in instances]
     identity = write_log(out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(columns.images), config.device), metadata)
     return _result(config, out, converted.rows, identity, start, tuple(notes))
@@ -196,9 +214,10 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
 
 def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.context.encoder import load_log_encoder
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF
     from osel_sim.episodes.drivers import choose_policies
+    from osel_sim.formats.dataset_mapping import load_dataset_mapping
     from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
     from osel_sim.sim.specification import specification
@@ -213,23 +232,25 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
         if not (camera and equals and column):
             raise SettingError("camera", f"must be CAMERA=COLUMN, got {item!r}")
         cameras[camera] = column
-    measured = Measurement(config.frames or 4, 0.05 if config.tolerance is None else config.tolerance, cameras)
+    mapping = load_dataset_mapping(config.map)
+    measured = Measurement(config.frames or 4, 0.05 if config.tolerance is None else config.tolerance, cameras, mapping, config.map)
     samples = open_datasets(config.dataset, specs, measured)
     instances = [sample.instance for sample in samples]
     inputs = check_out(out, instances)
+    name, texts = config.encoder or f"{DEFAULT_ENCODER}+{TFIDF}", [item.text for item in instances]
+    encoder = load_log_encoder(name, texts, True, config.device)  # one that cannot be loaded is found before the policies are asked, not after
     rows, source = measure_errors(samples, specs, measured)
     # By `metric`, replay and report know that what counts is the score.
     metadata = {"task": "action-mse", "policies": [spec.name for spec in specs], "source": {"metric": "action-mse", **source}}
-    texts = [item.text for item in instances]
-    name = config.encoder or f"{DEFAULT_ENCODER}+{TFIDF}"
-    identity = write_log(out, inputs, rows, instances, lambda: load_log_encoder(name, texts, True, config.device), metadata)
+    identity = write_log(out, inputs, rows, instances, lambda: encoder, metadata)
     return _result(config, out, rows, identity, start)
 
 
 def _columns(config: IngestConfig, out: Path) -> "Columns":
     from osel_sim.ingestion.columns import COMMAND_LINE
     from osel_sim.ingestion.columns_file import load_columns, parse_columns
-    from osel_sim.ingestion.flags import as_data
+    from osel_sim.ingestion.flags import as_data, scaled
+    from osel_sim.ingestion.readers import first_columns
 
     files = config.files or ()
     if config.map is not None:
@@ -240,12 +261,14 @@ def _columns(config: IngestConfig, out: Path) -> "Columns":
     for name in ("text", "success"):
         if getattr(config, name) is None:
             raise SettingError(name, "is missing; python -m osel_sim.ingest --help shows examples")
-    return parse_columns(as_data(config, files), COMMAND_LINE, Path())
+    return parse_columns(as_data(config, files, first_columns(Path(), files) if scaled(config) else ()), COMMAND_LINE, Path())
 
 
 def _result(config: IngestConfig, out: Path, rows: "list[Row]", encoder: str, start: float, notes: tuple[str, ...] = ()) -> IngestResult:
     from osel_sim.selection.reward import preset
 
-    name = config.preset or ("oxe" if config.metric == "action-mse" else "mmlu")
-    weights = replace(preset(name), success="score") if config.metric == "action-mse" else preset(name)
+    name = config.preset or DEFAULT_PRESET
+    weights = preset(name)
+    if config.metric == "action-mse":
+        weights = replace(weights, success="score")
     return IngestResult(out, rows, encoder, (weights, name), time.perf_counter() - start, notes)

@@ -69,17 +69,19 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
 
 
 def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordResult:
-    from osel_sim.core.files import read_json
     from osel_sim.core.holding import held, taken
     from osel_sim.formats.rollout_log import ROLLOUTS
-    from osel_sim.formats.run_config import RUN, check_run_folder
+    from osel_sim.formats.run_config import RUN, check_run_folder, read_run
     from osel_sim.formats.shards import SHARDS
+    from osel_sim.remote.policy import check_servers
 
     plan = _plan(config)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
-    before = read_json(folder / RUN) if config.resume and (folder / RUN).exists() else None
-    known = configuration if before is None else _as_it_began(configuration, before.get("configuration", {}))
+    before = read_run(folder) if config.resume and (folder / RUN).exists() else None
+    known = configuration if before is None else _as_it_began(configuration, before["configuration"])
     check_run_folder(folder, known, config.resume)
+    if before is None:
+        check_servers(plan.everyone, plan.tasks[0].specification)
     with held(folder) if before is not None else taken(folder, (SHARDS, ROLLOUTS)):
         return _record_into(folder, config, plan, configuration, known, before, encoder_given)
 
@@ -110,7 +112,7 @@ def _record_into(
     skills = declare(plan.policies, encoder, plan.tasks, config.tasks)
     configuration["encoder"] = encoder.identity
     # An encoder that was given is added; the one that was there must not have changed.
-    known["encoder"] = before.get("configuration", {}).get("encoder") if before and encoder_given else encoder.identity
+    known["encoder"] = before["configuration"].get("encoder") if before and encoder_given else encoder.identity
     for warning in start_or_resume(folder, known, ran_with(plan.tasks), config.resume, config.to_json()):
         logger.warning(warning)
     recording = Recording(folder, plan, encoder.identity, skills)
@@ -135,7 +137,7 @@ def _record_into(
 
 
 def _plan(config: RecordConfig) -> "Plan":
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.episodes.drivers import choose_policies, with_fallbacks
     from osel_sim.episodes.workers import Plan
     from osel_sim.formats.levels import parse_axes
@@ -180,13 +182,12 @@ def _configuration(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
 
 def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
     """The settings that a recording began with; policies, repeats and an encoder that were given come in addition."""
-    from osel_sim.core.files import read_json
-    from osel_sim.formats.run_config import RUN, check_run_folder
+    from osel_sim.formats.run_config import RUN, check_run_folder, read_run
     from osel_sim.interface.robot import DEFAULT_ROBOT
 
     folder = cast(Path, config.out)
     check_run_folder(folder, {}, resume=True)
-    began = read_json(folder / RUN).get("configuration", {})
+    began = read_run(folder)["configuration"]
     try:
         values = {name: began[key] for name, key in _FIXED.items()}
         values["axis"] = tuple(part for axes in began["axes"] for part in axes.split(","))
@@ -206,6 +207,8 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
     except KeyError as missing:
         raise DataError(f"{folder / RUN}: not of a recording by this version, it has no {missing}; give all flags it was made with") from None
+    except (TypeError, AttributeError) as error:
+        raise DataError(f"{folder / RUN}: configuration does not have the promised form ({error})") from None
     return config.changed(**values)
 
 
@@ -237,10 +240,11 @@ def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
     plan, missing = recording.plan, recording.missing()
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
     unit = "episode" if left else "context"
+    logger.info("starting %d workers: they load the encoder%s ...", workers, ", policies and servers" if left else "")
     start = time.perf_counter()
     done, successes = 0, 0.0
     with progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar:
-        for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers):  # contexts alone need no policy
+        for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers, bar.begin):  # contexts alone need no policy
             if recorded is None:
                 bar.update()
                 continue

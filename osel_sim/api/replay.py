@@ -103,6 +103,7 @@ class _Replay:
         """Do it."""
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
+        from osel_sim.analysis.logged_choices import choices_of, has_choices
         from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
 
         config, folder = self.config, self.config.folder
@@ -111,9 +112,13 @@ class _Replay:
         check_replay_folder(folder, config.overwrite)
         if not is_live_run(config.log):
             log = read_log(config.log, config.encoder)
-            return self._replay(selectors, log, *weights_of(config, log.metadata))
-        live = read_live(config.log, config.encoder)
-        weights, preset = weights_of(config, recorded=live.reward)
+            weights, preset = weights_of(config, log.metadata)
+            if not has_choices(log):
+                return self._replay(selectors, log, weights, preset)
+            live = choices_of(log)
+        else:
+            live = read_live(config.log, config.encoder)
+            weights, preset = weights_of(config, recorded=live.reward)
         found = self._off_policy(live, weights)
         if live.has_all_outcomes(weights):
             return self._replay(selectors, live.outcomes, weights, preset, found)
@@ -228,7 +233,7 @@ class _Replay:
         from osel_sim.analysis.evaluation import evaluate
 
         if self.config.policies or self.config.half:
-            raise UsageError("--policies and --half are for rollout logs: a live run is evaluated as it was made")
+            raise UsageError("--policies and --half are for rollout logs: decisions that were made are evaluated as they were made")
         return evaluate(live, weights)
 
 

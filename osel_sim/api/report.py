@@ -1,5 +1,10 @@
 """The page of a live run, a replay or a rollout log."""
 
+import contextlib
+import logging
+import os
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +17,8 @@ if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.reporting.page import Page
 
+logger = logging.getLogger(__name__)
+
 
 @settings
 class ReportConfig(LoggedRewardSettings):
@@ -23,12 +30,16 @@ class ReportConfig(LoggedRewardSettings):
     """where to write (default: into the folder itself)"""
     open: Annotated[bool, MAIN] = False
     """show it in the browser"""
+    watch: Annotated[bool, MAIN] = False
+    """of a live run that goes on: serve the page on this machine, growing with the run, until Ctrl-C"""
     scenes: Annotated[Index, MAIN] = 0
     """render how so many instances begin, again from their seeds"""
     log: Annotated[Folder | None, OTHER] = None
     """of a replay: its rollout log, where that is no longer where it was"""
     encoder: Annotated[str | None, OTHER] = None
     """of a rollout log: whose contexts, where it has several (default: the one it was recorded with)"""
+    watch_stdin: Annotated[bool, OTHER] = False
+    """with --watch: end when standard input does (for a program that starts it)"""
     tasks: Annotated[Folder | None, CONTENT] = None
     """with --scenes: folder with task files of your own"""
 
@@ -67,10 +78,54 @@ def report(folder: "Path | str | ReportConfig", **values: Any) -> ReportResult:
     return ReportResult(page)
 
 
-def _page(config: ReportConfig) -> "Page":
-    from osel_sim.analysis.live import JOURNAL
+def watch(folder: "Path | str | ReportConfig", on_start: Callable[[str], None], **values: Any) -> None:
+    """Serve the page of a live run on this machine while it grows, until Ctrl-C (KeyboardInterrupt, which is not raised).
+
+    Args:
+        folder: of a run, which need not have made a decision; or all settings as one object, of which `values` change some.
+        on_start: told the address.
+        values: settings by name, as `ReportConfig` has them.
+
+    Raises:
+        OselError: the folder holds no live run.
+    """
+    from osel_sim.formats.run_config import RUN
+    from osel_sim.reporting.watch import WatchedPage
+
+    config = folder.changed(**values) if isinstance(folder, ReportConfig) else ReportConfig.of(folder=Path(folder), **values)
+    if not (config.folder / RUN).is_file() or _is_finished_log(config.folder):
+        raise SettingError("watch", f"{config.folder} holds no live run (python -m osel_sim.run); leave the flag out")
+    page, stop = WatchedPage(config.folder), threading.Event()
+    on_start(page.url)
+    if config.watch_stdin:
+        threading.Thread(target=_set_at_end_of_stdin, args=(stop,), daemon=True).start()
+    if config.open:
+        import webbrowser
+
+        webbrowser.open(page.url)
+    with contextlib.suppress(KeyboardInterrupt):
+        page.serve(stop)
+
+
+def _set_at_end_of_stdin(stop: threading.Event) -> None:
+    while os.read(0, 4096):
+        pass
+    stop.set()
+
+
+def _is_finished_log(folder: Path) -> bool:
     from osel_sim.formats.replay_result import REPLAY
     from osel_sim.formats.rollout_log import ROLLOUTS
+    from osel_sim.formats.shards import SHARDS
+
+    return any((folder / name).is_file() for name in (REPLAY, ROLLOUTS, SHARDS))
+
+
+def _page(config: ReportConfig) -> "Page":
+    from osel_sim.formats.journal import JOURNAL
+    from osel_sim.formats.replay_result import REPLAY
+    from osel_sim.formats.rollout_log import ROLLOUTS
+    from osel_sim.formats.shards import SHARDS
 
     folder = config.folder
 
@@ -86,6 +141,14 @@ def _page(config: ReportConfig) -> "Page":
         log = read_log(folder, config.encoder)
         weights, _ = weights_of(config, log.metadata)
         return log_page(log, weights, draw)
+    if (folder / SHARDS).is_file():
+        from osel_sim.analysis.log import read_unfinished
+        from osel_sim.reporting.log_page import log_page
+
+        log, rows = read_unfinished(folder)
+        logger.warning("%s: the recording goes on or was interrupted; its page is of the %d instances so far", folder, len(log))
+        weights, _ = weights_of(config, log.metadata)
+        return log_page(log, weights, draw, rows)
     for setting in ("encoder", *FLAGS):
         if getattr(config, setting) is not None:
             raise SettingError(setting, f"{folder} is no rollout log; a run and a replay have what they were made with")

@@ -36,11 +36,15 @@ if TYPE_CHECKING:
     from osel_sim.interface.selector import Selector, SelectorFactory
     from osel_sim.interface.suite import Task
     from osel_sim.policy.objects import PolicyObject
+    from osel_sim.reporting.live_page import LivePage
     from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | SelectorFactory
 
 logger = logging.getLogger(__name__)
+
+FILMED_EVERY = 5
+"""Of a run that is viewed, one in so many decisions is filmed."""
 
 
 @settings
@@ -67,6 +71,10 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """run the other policies as well, from the same state, to compare (nothing is learnt from them)"""
     video: Annotated[Index, OUTPUT] = 0
     """film so many decisions, spread evenly over the run"""
+    view: Annotated[bool, OUTPUT] = False
+    """show the run in the browser while it goes on: a page on this machine that grows every few decisions, with the last film"""
+    no_page: Annotated[bool, OUTPUT] = False
+    """do not write the page about it, which takes some seconds; python -m osel_sim.report does so later"""
     tensorboard: Annotated[bool, OUTPUT] = False
     """also write TensorBoard event files (needs the package tensorboard)"""
     realtime: Annotated[bool, OTHER] = False
@@ -83,7 +91,9 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
 
     @property
     def filmed(self) -> frozenset[int]:
-        """Indices of the decisions to film: the first, the last, and evenly between."""
+        """Indices of the decisions to film: the first, the last, and evenly between; with `view` every few, unless it is said how many."""
+        if self.view and not self.video:
+            return frozenset(range(0, self.episodes, FILMED_EVERY))
         count = min(self.video, self.episodes)
         if count == 1:
             return frozenset({0})
@@ -145,7 +155,6 @@ class _Run:
         from osel_sim.api.reward import weights_of
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
-        from osel_sim.reporting.live_page import LivePage
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
         self.config, self.objects, self.factory, self.watchers = config, objects, factory, watchers
@@ -163,16 +172,18 @@ class _Run:
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
         self.axes_above = sorted({instance.axes for instance in drawn if instance.axes})
-        self.page = LivePage()
+        self.page = self._page()
 
     def execute(self) -> RunResult:
         """Do it."""
         from osel_sim.core.holding import held
         from osel_sim.formats.run_config import check_run_folder
+        from osel_sim.remote.policy import check_servers
 
         config, folder = self.config, self.config.folder
         configuration = self._configuration()
         check_run_folder(folder, configuration, config.resume)
+        check_servers(self.everyone, self.environment)
         with contextlib.ExitStack() as holding:
             if config.resume:
                 holding.enter_context(held(folder))
@@ -180,8 +191,8 @@ class _Run:
 
     def _run(self, folder: Path, configuration: dict[str, Any], holding: contextlib.ExitStack) -> RunResult:
         from osel_sim.context.encoder import load_encoder
-        from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
-        from osel_sim.episodes.live import JOURNAL
+        from osel_sim.context.names import DEFAULT_ENCODER
+        from osel_sim.formats.journal import JOURNAL
         from osel_sim.formats.run_config import start_or_resume
         from osel_sim.suites.ran_with import ran_with
 
@@ -286,11 +297,20 @@ class _Run:
         from osel_sim.episodes.progress import Progress
         from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
         from osel_sim.episodes.tensorboard import TensorBoard
+        from osel_sim.reporting.view import View
 
         config = self.config
-        films = [Films(folder, config.filmed)] if config.video else []
-        wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard)) if asked]
-        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), self.page]
+        films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
+        wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
+        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
+
+    def _page(self) -> "LivePage | None":
+        """Writes the page, if one is wanted."""
+        if self.config.no_page:
+            return None
+        from osel_sim.reporting.live_page import LivePage
+
+        return LivePage()
 
     def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
@@ -306,9 +326,9 @@ class _Run:
         from osel_sim.api.run_files import write_results
 
         summary = write_results(live, title(self.tasks), self.config.selector)
-        if self.page.problem is not None:
+        if self.page is not None and self.page.problem is not None:
             logger.warning("no report.html: %s", self.page.problem)
-        return RunResult(live.folder, summary, tuple(live.decisions), self.page.file, interrupted)
+        return RunResult(live.folder, summary, tuple(live.decisions), self.page.file if self.page else None, interrupted)
 
 
 class _Interrupt:

@@ -12,7 +12,7 @@ logger = logging.getLogger(__name__)
 def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     """Write them. Returns the summary, empty where no decision was made."""
     from osel_sim.core.files import write_json
-    from osel_sim.formats.summary import summarise
+    from osel_sim.formats.summary import SUMMARY, summarise
     from osel_sim.selection.state import save_state
 
     if not live.decisions:
@@ -23,7 +23,7 @@ def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     summary = {"task": title, **summarise(live.decisions, policies, selector)}
     if live.options.counterfactual:
         summary |= _comparison(live, chosen)
-    write_json(live.folder / "summary.json", summary)
+    write_json(live.folder / SUMMARY, summary)
     if hasattr(live.selector, "state_dict"):  # a selector of one's own need only choose and learn; a resumed run learns from the journal anyway
         save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
     return summary

@@ -1,19 +1,26 @@
 """A policy over WebSocket."""
 
+import contextlib
 import json
+import logging
 import os
 import secrets
+import sys
 import threading
-from typing import TYPE_CHECKING, Annotated
+from collections.abc import Iterator
+from typing import IO, TYPE_CHECKING, Annotated
 
 from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UsageError
 from osel_sim.core.trust import trusting
+from osel_sim.remote.address import check_address
 from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting, check_token
 from osel_sim.remote.serving import run_until_signal, stop_with_stdin
 
 if TYPE_CHECKING:
     from osel_sim.interface.environment import EnvironmentSpec
+
+logger = logging.getLogger(__name__)
 
 
 @settings
@@ -36,6 +43,8 @@ class ServeConfig(TrustSettings):
     """what it will drive as JSON, in place of --task (for a program that starts the server)"""
     watch_stdin: Annotated[bool, OTHER] = False
     """stop when standard input ends (for a program that starts the server)"""
+    ready_fd: Annotated[int | None, OTHER] = None
+    """file descriptor for the line that says it is ready, in place of standard output (for a program that starts the server)"""
 
 
 def serve(config: ServeConfig) -> None:
@@ -46,11 +55,27 @@ def serve(config: ServeConfig) -> None:
     """
     if config.watch_stdin:
         threading.Thread(target=stop_with_stdin, daemon=True).start()
-    with trusting(config.trust):
-        _serve(config)
+    # What a policy prints must not come before the line that a program may wait for.
+    with _ready_line(config.ready_fd) as out, contextlib.redirect_stdout(sys.stderr), trusting(config.trust):
+        _serve(config, out)
 
 
-def _serve(config: ServeConfig) -> None:
+@contextlib.contextmanager
+def _ready_line(descriptor: int | None) -> Iterator[IO[str]]:
+    """Where the line goes that says that the server is ready."""
+    if descriptor is None:
+        yield sys.stdout
+        return
+    try:
+        os.set_inheritable(descriptor, False)  # whoever waits for the line sees that this process ended, also where its children have not
+        out = os.fdopen(descriptor, "w", encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise SettingError("ready_fd", f"{descriptor} cannot be written to ({error})") from None
+    with out:
+        yield out
+
+
+def _serve(config: ServeConfig, out: IO[str]) -> None:
     if not 0 <= config.port <= 65535:
         raise SettingError("port", f"must lie in [0, 65535], got {config.port}")
     from osel_sim.formats import library
@@ -65,6 +90,10 @@ def _serve(config: ServeConfig) -> None:
     if given is None and not is_loopback(config.host):
         raise UsageError(f"--host {config.host} can be reached from other machines: put a token into the environment variable {config.token_env}")
     token = check_token(given) if given is not None else secrets.token_urlsafe(32)
+    check_address(config.host, config.port)
+    if not config.watch_stdin:  # who starts the server itself knows
+        secret = f"the token in {config.token_env}" if given is not None else f"a token that is printed then (none is in {config.token_env})"
+        logger.info("loading %s; clients connect to port %s of %s with %s ...", spec.name, config.port or "(a free one)", config.host, secret)
     environment = _environment(config)
     greeting = Greeting.of(spec, environment)
     make_session = session_factory(spec, environment)
@@ -74,7 +103,7 @@ def _serve(config: ServeConfig) -> None:
     def ready(port: int) -> None:
         host = f"[{config.host}]" if ":" in config.host else config.host
         line = {"policy": spec.name, "url": f"ws://{host}:{port}", "port": port}
-        print(json.dumps(line if given is not None else {**line, "token": token}), flush=True)
+        print(json.dumps(line if given is not None else {**line, "token": token}), file=out, flush=True)
 
     run_until_signal(server, ready)
 

@@ -129,7 +129,7 @@ class RewardSettings(Settings):
     """weight of time in the reward (default: the preset's)"""
     alpha_price: Annotated[NonNegative | None, REWARD] = None
     """weight of the price in cents (default: the preset's)"""
-    time_unit: Annotated[Literal["log10-seconds", "steps"] | None, REWARD] = None
+    time_unit: Annotated[Literal["log10-seconds", "log10-steps", "steps"] | None, REWARD] = None
     """time in the reward (default: the preset's)"""
 
 

@@ -54,6 +54,8 @@ class TrainConfig(TrustSettings):
     """save the state for --resume every so many steps"""
     half: Annotated[bool, OTHER] = False
     """save the weights in half precision"""
+    map: Annotated[Path | None, CONTENT] = None
+    """file that says which names and conventions of the datasets are others than ours"""
     recipe: Annotated[Path | None, CONTENT] = None
     """file with sizes and settings (default: policies/training/NAME.toml)"""
     policies_dir: Annotated[Path | None, CONTENT] = None
@@ -138,6 +140,7 @@ def train(config: TrainConfig | None = None, /, **values: Any) -> tuple[Path, di
         half=config.half,
         tasks=config.tasks,
         init=config.init,
+        mapping=config.map,
     )
     with trusting(config.trust), held(out) if config.resume and out.is_dir() else nullcontext():
         return out, policy_training.train(spec, recipe, config.data, options)
@@ -156,7 +159,7 @@ def train_encoder(config: EncoderTrainConfig | None = None, /, **values: Any) ->
     Raises:
         OselError: whatever is wrong with the settings or the folder; the message says what.
     """
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.suites.registry import select_task_files
     from osel_sim.training.encoder import train as encoder_training
 

@@ -21,6 +21,7 @@ from osel_sim.core.caches import prepare
 from osel_sim.core.docstrings import field_docstrings
 from osel_sim.core.errors import OselError, SettingError, UnknownNameError, UsageError, did_you_mean
 from osel_sim.core.shown import shown
+from osel_sim.core.this_python import lacking
 
 if TYPE_CHECKING:
     from cyclopts import App
@@ -175,9 +176,10 @@ def read_settings(file: Path, config: type[Settings]) -> dict[str, Any]:
 def reported(function: Callable[[], int]) -> int:
     """Run a command; what goes wrong becomes one line and an exit code.
 
-    An `OselError` becomes one line `error: ...` on standard error and its exit code, likewise a file that cannot be written or a full disk; Ctrl-C
-    becomes a short line and 130; a reader that has gone (`| head`) ends the command without a word. Messages of the package's logger go to standard
-    error meanwhile. Letters that the terminal's encoding lacks are written as escapes, such as `\\u7b56`.
+    An `OselError` becomes one line `error: ...` on standard error and its exit code, likewise a package that is not installed, a file that cannot be
+    written or a full disk; Ctrl-C becomes a short line and 130; a reader that has gone (`| head`) ends the command without a word. Messages of the
+    package's logger go to standard error meanwhile. Letters that the terminal's encoding lacks
+    are written as escapes, such as `\\u7b56`.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -193,6 +195,11 @@ def reported(function: Callable[[], int]) -> int:
         return _complain(flag + error.problem, error.exit_code)
     except OselError as error:
         return _complain(str(error), error.exit_code)
+    except ModuleNotFoundError as error:
+        package = (error.name or "").partition(".")[0]
+        if package in ("", "osel_sim"):
+            raise
+        return _complain(lacking(package), USAGE)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -1,14 +1,16 @@
-"""Tables on the terminal."""
+"""Tables on the terminal. What they hold are names and words of others: `model [v2]` is no markup, `:fire:` no emoji."""
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+from rich import table
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
-from rich.table import Table
+from rich.text import Text
 
 from osel_sim.core.shown import shown
+from osel_sim.selection.registry import RECOMMENDATION, is_recommended
 
 
 class SafeConsole(Console):
@@ -22,7 +24,33 @@ class SafeConsole(Console):
 
 def console() -> Console:
     """Standard output; wide enough for a table where it is no terminal."""
-    return SafeConsole(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False)
+    return SafeConsole(file=sys.stdout, width=None if sys.stdout.isatty() else 160, highlight=False, markup=False, emoji=False)
+
+
+def plain(text: str, style: str = "") -> Text:
+    """A text for the terminal that is shown as it is, on any console."""
+    return Text(shown(text), style)
+
+
+class Table(table.Table):
+    """The tables of all commands. Cells are texts as they are; one too long for its column is folded, never cut off.
+
+    Args:
+        title: above it.
+        texts: headings of the first columns.
+        numbers: headings of the others, whose cells stand on the right.
+    """
+
+    def __init__(self, title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> None:
+        super().__init__(title=plain(title, "italic"), title_justify="left")
+        for heading in texts:
+            self.add_column(plain(heading), overflow="fold")
+        for heading in numbers:
+            self.add_column(plain(heading), overflow="fold", justify="right")
+
+    def add(self, *cells: str | Text) -> None:
+        """Add a row; a `Text` keeps its style."""
+        self.add_row(*(plain(cell) if isinstance(cell, str) else cell for cell in cells))
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -39,13 +67,13 @@ def percent(rate: float | None, interval: tuple[float, float] | list[float] | No
 
 def run_table(summary: dict[str, Any]) -> Table:
     """The selector, each policy where it was chosen, and with a counterfactual what could have been."""
-    table = Table(title=f"{summary['task']}: {summary['decisions']} decisions", title_justify="left")
-    table.add_column("")
-    for heading in ("decisions", "mean reward", "success [95%]", "steps", "seconds", "price (cents)", "fallbacks", "solved by them", "errors"):
-        table.add_column(heading, justify="right")
-    parts = [(f"[bold]{summary['selector']}[/bold]", summary), *((f"  chose {name}", part) for name, part in summary["policies"].items())]
-    for name, part in parts:
-        table.add_row(
+    headings = ("decisions", "mean reward", "success [95%]", "steps", "seconds", "price (cents)", "fallbacks", "solved by them", "errors")
+    found = Table(f"{summary['task']}: {summary['decisions']} decisions", [""], headings)
+    if not is_recommended(summary["selector"]):
+        found.caption, found.caption_justify = plain(f"{RECOMMENDATION}."), "left"
+    chosen = ((plain(f"  chose {name}"), part) for name, part in summary["policies"].items())
+    for name, part in ((plain(summary["selector"], "bold"), summary), *chosen):
+        found.add(
             name,
             str(part["decisions"]),
             number(part["mean_reward"], 3),
@@ -58,9 +86,9 @@ def run_table(summary: dict[str, Any]) -> Table:
             str(part["errors"]),
         )
     if "regret" in summary:
-        table.add_section()
+        found.add_section()
         for name, value in summary["always"].items():
-            table.add_row(f"always {name}" + (" (best single)" if name == summary["best_single_policy"] else ""), "", number(value, 3))
-        table.add_row("hindsight oracle", "", number(summary["hindsight_oracle"], 3))
-        table.add_row("regret a decision", "", number(summary["regret"], 3))
-    return table
+            found.add(f"always {name}" + (" (best single)" if name == summary["best_single_policy"] else ""), "", number(value, 3))
+        found.add("hindsight oracle", "", number(summary["hindsight_oracle"], 3))
+        found.add("regret a decision", "", number(summary["regret"], 3))
+    return found

@@ -1,22 +1,28 @@
-"""The tasks, robots, policies and suites there are, for `python -m osel_sim.run --list`: reads TOML and imports no simulator."""
+"""What there is to choose from, for `python -m osel_sim.run --list`: reads TOML and imports no simulator."""
 
+import contextlib
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from osel_sim.api.reward import DEFAULT_PRESET
+from osel_sim.context.names import ABOUT, FORMS, PLUGINS, embedded_encoders
 from osel_sim.core import content
 from osel_sim.core.errors import OselError
 from osel_sim.core.shown import all_shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.selection import registry as selectors
+from osel_sim.selection.weights import PRESETS
 from osel_sim.sim.robots import ROBOTS
 from osel_sim.suites import SUITES
 
 
 def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str, list[dict[str, Any]]]:
-    """All tasks, robots, policies and suites of others, by name, as plain data.
+    """All tasks, robots, policies, suites of others, selectors, encoders and reward presets, by name, as plain data.
 
     Args:
         tasks: a folder of the user's own task files.
@@ -30,34 +36,62 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
         "robots": [{"name": name} for name in sorted(ROBOTS.locations())],
         "policies": [_policy(load_policy_file(file)) for _, file in sorted(content.files("policies", policies).items())],
         "suites": [_suite(name) for name in SUITES.others()],
+        "selectors": [{"name": name, "about": selectors.ABOUT.get(name, f"of another package ({place})")} for name, place in _selectors()],
+        "encoders": [{"name": name, "about": about} for name, about in _encoders()],
+        "presets": [{"name": name, **asdict(weights)} for name, weights in PRESETS.items()],
     }
 
 
 def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Path | None = None) -> None:
     """Print the listing as tables, or as JSON."""
-    found = listing(tasks, policies)
+    with contextlib.redirect_stdout(sys.stderr):  # what plugins print while they load is no part of it
+        found = listing(tasks, policies)
     if as_json:
         print(json.dumps(found, indent=2))
         return
-    from rich.table import Table
+    from osel_sim.cli.console import Table, console, plain
+    from osel_sim.cli.next_step import print_next
 
-    from osel_sim.cli.console import console
-
-    table = Table("task", "title", "tags", "steps", title="Tasks", title_justify="left")
+    columns = ("task", "title", "tags", "steps")
+    table = Table("Tasks", columns)
     for task in found["tasks"]:
-        table.add_row(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
+        table.add(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
     console().print(table)
     console().print(f"Robots, for --robot: {', '.join(robot['name'] for robot in found['robots'])}; {DEFAULT_ROBOT} unless a task file names another")
     for suite in found["suites"]:
-        table = Table("task", "title", "tags", "steps", title=f"Tasks of {suite['name']}: {suite['title']}", title_justify="left")
+        table = Table(f"Tasks of {suite['name']}: {suite['title']}", columns)
         for task in suite["tasks"]:
-            table.add_row(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
-        console().print(table if suite["problem"] is None else f"{suite['name']}: {suite['problem']}")
-    table = Table("policy", "title", "where", "kind", title="Policies", title_justify="left")
+            table.add(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
+        console().print(table if suite["problem"] is None else plain(f"{suite['name']}: {suite['problem']}"))
+    table = Table("Policies", ("policy", "title", "where", "kind"))
     for policy in found["policies"]:
         where = "local" if policy["remote"] is None else f"remote ({policy['remote']['network']})"
-        table.add_row(policy["name"], policy["title"], where + (", privileged" if policy["privileged"] else ""), policy["kind"])
+        table.add(policy["name"], policy["title"], where + (", privileged" if policy["privileged"] else ""), policy["kind"])
     console().print(table)
+    for things, heading in (("selectors", "Selectors, for --selector"), ("encoders", "Encoders of contexts, for --encoder")):
+        table = Table(heading, ("name", "what it is"))
+        for thing in found[things]:
+            table.add(thing["name"], thing["about"])
+        console().print(table)
+    table = Table("Reward weights of the paper, for --preset", ("preset", "reward"))
+    for weights in found["presets"]:
+        reward = f"{weights['success']} - {weights['alpha_time']:g} {weights['time_unit']} - {weights['alpha_price']:g} cents"
+        table.add(weights["name"], reward + (" (default)" if weights["name"] == DEFAULT_PRESET else ""))
+    console().print(table)
+    names, own = [task["name"] for task in found["tasks"]], ["--tasks", tasks] if tasks is not None else []
+    first = "pick_place" if "pick_place" in names else names[0]
+    print_next(("runs a task with the selector we recommend", "run", ["--task", first, *own, "--selector", selectors.RECOMMENDED]))
+
+
+def _selectors() -> list[tuple[str, str]]:
+    """Name and place of each, the recommended one first."""
+    return sorted(selectors.selector_locations().items(), key=lambda item: (item[0] != selectors.RECOMMENDED, item[0]))
+
+
+def _encoders() -> list[tuple[str, str]]:
+    """Names and forms of names, with a line about each."""
+    own = [(name, ABOUT.get(name, "comes with the package")) for name in embedded_encoders()]
+    return [*own, *((name, f"of another package ({PLUGINS.locations()[name]})") for name in PLUGINS.others()), *FORMS.items()]
 
 
 def _task(task: TaskSpec) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What `doctor` looks at: Python, packages, display, machine, tasks, suites, policies and the encoder."""
+"""What `doctor` looks at: Python, packages, display, machine, tasks, suites, policies and the encoder. Imports nothing that may be missing."""
 
 import importlib.metadata
 import os
@@ -6,8 +6,9 @@ import platform
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from osel_sim.core import content
@@ -18,11 +19,8 @@ from osel_sim.core.proxies import settings
 from osel_sim.core.shown import shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import load_task_file
-from osel_sim.policy.environment_fit import misfits
 from osel_sim.sim.robots import with_robot
-from osel_sim.sim.specification import specification
 from osel_sim.suites import SUITES
-from osel_sim.suites.registry import load_suite
 
 DISTRIBUTION = "osel-sim"
 CONFIG = "config.json"
@@ -56,7 +54,26 @@ def examine(tasks: Path | None = None, policies: Path | None = None) -> list[Che
         tasks: a folder of the user's own task files.
         policies: a folder of the user's own policy files.
     """
-    return [*_python(), *_packages(), *_display(), *_machine(), *_tasks(tasks), *_suites(), *_policies(policies), *_encoder()]
+    areas: dict[str, Callable[[], Iterator[Check]]] = {
+        "python": _python,
+        "packages": _packages,
+        "display": _display,
+        "machine": _machine,
+        "tasks": partial(_tasks, tasks),
+        "suites": _suites,
+        "policies": partial(_policies, policies),
+        "encoder": _encoder,
+    }
+    return [check for area, checks in areas.items() for check in _as_far_as_possible(area, checks)]
+
+
+def _as_far_as_possible(area: str, checks: Callable[[], Iterator[Check]]) -> Iterator[Check]:
+    """The checks of an area; where a package is missing that they themselves need, that."""
+    try:
+        yield from checks()
+    except ModuleNotFoundError as error:
+        package = (error.name or str(error)).partition(".")[0]
+        yield Check(area, "not looked at", f"for want of the package {package!r}", MISSING, _install(package))
 
 
 def _python() -> Iterator[Check]:
@@ -176,6 +193,8 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
 
 def _suites() -> Iterator[Check]:
     """Suites of others that are installed; nothing of ours needs one."""
+    from osel_sim.suites.registry import load_suite
+
     for name in SUITES.others():
         try:
             suite = load_suite(name)
@@ -185,6 +204,9 @@ def _suites() -> Iterator[Check]:
 
 
 def _policies(folder: Path | None) -> Iterator[Check]:
+    from osel_sim.policy.environment_fit import misfits
+    from osel_sim.sim.specification import specification
+
     found = content.files("policies", folder)
     if not found:
         yield Check("policies", "none", f"no policy file in {content.root() / 'policies'}", MISSING, _install(DISTRIBUTION))
@@ -214,7 +236,7 @@ def _checkpoint(policy: PolicySpec) -> Check:
 
 
 def _encoder() -> Iterator[Check]:
-    from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+    from osel_sim.context.names import DEFAULT_ENCODER
 
     folder = content.root() / "assets" / "encoders" / DEFAULT_ENCODER
     train = f"python -m osel_sim.train --encoder --data DIR --out {folder}"

@@ -3,29 +3,22 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
-from osel_sim.cli.console import number, percent
+from osel_sim.cli.console import Table, number, percent, plain
 
 
 def print_replay(console: Console, result: Mapping[str, Any]) -> None:
     """Print the selectors from best to worst, the oracles, and the verdict."""
     log, learnable = result["log"], result["learnable_oracle"]["name"]
-    table = Table(
-        box=box.SIMPLE,
-        title=f"{_few(log['tasks'])}: {result['decisions']} decisions of {log['instances']} instances, {len(result['seeds'])} seeds",
-        title_justify="left",
-    )
-    table.add_column("", no_wrap=True)
-    for heading in ("mean reward [95%]", "success", "seconds", "cents", "gap closed [95%]", "last quarter [95%]", "regret", "ahead at"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    title = f"{_few(log['tasks'])}: {result['decisions']} decisions of {log['instances']} instances, {len(result['seeds'])} seeds"
+    headings = ("mean reward [95%]", "success", "seconds", "cents", "gap closed [95%]", "last quarter [95%]", "regret", "ahead at")
+    table = Table(title, [""], headings)
     for name, entry in sorted(result["selectors"].items(), key=lambda item: -item[1]["mean_reward"]):
         if name in ("best_single", "worst_single"):
             continue
         best = result["selectors"]["best_single"]["policy"] == entry.get("policy")
-        table.add_row(
+        table.add(
             name + (" (best)" if best else ""),
             _with_interval(entry["mean_reward"], entry["ci95"]),
             percent(entry["success_rate"]),
@@ -39,40 +32,45 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
     table.add_section()
     for name, entry in result["oracles"].items():
         if name != "best_single":
-            table.add_row(f"{name.replace('_', ' ')} oracle", _with_interval(entry["mean_reward"], entry["ci95"]))
+            table.add(f"{name.replace('_', ' ')} oracle", _with_interval(entry["mean_reward"], entry["ci95"]))
     console.print(table)
-    console.print(f"gap closed and regret: by the {learnable} oracle; ahead at: from that decision on the sum of rewards exceeds the best policy's")
+    notes = [f"gap closed and regret: by the {learnable} oracle; ahead at: from that decision on the sum of rewards exceeds the best policy's"]
     learners = {name: entry for name, entry in result["selectors"].items() if entry["kind"] == "learner"}
     if learnable != "predictable" and learners:
         best = max(learners, key=lambda name: float(learners[name]["mean_reward"]))
         whole, late = (
             percent(learners[best][f"predictable_gap_closed{part}"], learners[best][f"predictable_gap_closed{part}_ci95"]) for part in ("", "_late")
         )
-        console.print(f"of the gap to the predictable oracle {best} closed {whole}, in the last quarter {late}")
+        notes.append(f"of the gap to the predictable oracle {best} closed {whole}, in the last quarter {late}")
     if learnable == "predictable":
-        console.print(
-            "The log has no repeats, so there is no expected oracle: the gap is that of the predictable one (best policy by group, cross-fitted)."
-        )
+        notes.append("no repeats, so there is no expected oracle: the gap is that of the predictable one (best policy by group, cross-fitted)")
     if result["log"]["left_out"]["instances"]:
-        console.print(f"{log['left_out']['instances']} instances without an outcome of every policy were left out.")
-    console.print(f"[bold]{result['verdict']['text']}[/bold]", soft_wrap=True)
+        notes.append(f"{log['left_out']['instances']} instances without an outcome of every policy were left out.")
+    for note in notes:
+        console.print(plain(note))
+    console.print(plain(result["verdict"]["text"], "bold"), soft_wrap=True)
 
 
 def print_off_policy(console: Console, found: Mapping[str, Any]) -> None:
     """Print what other ways of choosing would have earned in a live run."""
     run = found["run"]
-    table = Table(box=box.SIMPLE, title=f"{run['selector']}, {run['decisions']} decisions: what others would have earned", title_justify="left")
-    table.add_column("")
-    for heading in ("IPS [95%]", "SNIPS [95%]", "DR [95%]", "effective decisions"):
-        table.add_column(heading, justify="right")
-    table.add_row(f"{run['selector']} (as it was)", "", "", _with_interval(run["mean_reward"], run["ci95"]), str(run["decisions"]))
+    title = f"{run['selector']}, {run['decisions']} decisions: what others would have earned"
+    table = Table(title, [""], ("measured", "IPS [95%] (n)", "SNIPS [95%] (n)", "DR [95%] (n)"))
+    table.add(f"{run['selector']} (as it was)", _with_interval(run["mean_reward"], run["ci95"]), "", "", "")
     table.add_section()
     for name, entry in found["targets"].items():
-        cells = [_with_interval(entry[key], entry[f"{key}_ci95"]) if entry[key] is not None else "-" for key in ("ips", "snips", "dr")]
-        table.add_row(name, *cells, f"{entry['effective_decisions']:.0f}" + (" (unsupported)" if entry["unsupported"] else ""))
+        cells = [_estimate(entry, way) for way in ("ips", "snips", "dr")]
+        table.add(name + (" (unsupported)" if entry["unsupported"] else ""), number(entry["measured"], 3), *cells)
     console.print(table)
+    console.print("n: effective decisions, that is how many made that way would weigh as much; an estimate that rests on too few is not shown")
     if run["errors"]:
         console.print(f"{run['errors']} decisions that ended in error were left out.")
+
+
+def _estimate(entry: Mapping[str, Any], way: str) -> str:
+    """An estimate with the number of decisions that it rests on."""
+    shown = "-" if entry[way] is None or way in entry["few"] else _with_interval(entry[way], entry[f"{way}_ci95"])
+    return f"{shown} ({entry[f'{way}_effective']:.0f})"
 
 
 def _few(tasks: Sequence[str]) -> str:

@@ -6,9 +6,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 from rich.console import Console
-from rich.table import Table
 
-from osel_sim.cli.console import number, percent
+from osel_sim.cli.console import Table, number, percent
 from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import Row
 from osel_sim.interface.outcome import credited
@@ -64,27 +63,26 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
     instances = len({row.instance for row in rows})
     tasks = {row.task: None for row in rows}
     title = f"{len(tasks)} tasks" if len(tasks) > 1 else next(iter(tasks), "")
-    table = Table(title=f"{title}: {instances} instances, {len(rows)} episodes", title_justify="left")
-    table.add_column("policy")
     optional = {name: (heading, digits) for name, (heading, digits) in _MEASURES.items() if any(getattr(row, name) is not None for row in rows)}
     seconds, rewards = row_seconds(rows), row_rewards(rows, weights)
     timed = bool(np.isfinite(seconds).any())
     headings = ["episodes", "success [95%]", *(heading for heading, _ in optional.values()), *(["seconds"] if timed else [])]
-    for heading in (*headings, "mean reward", "best on", "fallbacks", "solved by them", "errors"):
-        table.add_column(heading, justify="right")
+    headings += ["mean reward", "best on", "fallbacks", "solved by them", "errors"]
+    table = Table(f"{title}: {instances} instances, {len(rows)} episodes", ["policy"], headings)
     best = share_best(rows, policies, weights)
     for policy in policies:
         own = [row for row in rows if row.policy == policy]
         valid = [row for row in own if row.error is None]
         counted = np.array([row.policy == policy and row.error is None for row in rows])
-        measured = [number(_mean([getattr(row, name) for row in valid]), digits) for name, (_, digits) in optional.items()]
-        table.add_row(
+        on = [row.instance for row in valid]
+        measured = [number(_mean([getattr(row, name) for row in valid], on), digits) for name, (_, digits) in optional.items()]
+        table.add(
             policy,
             str(len(own)),
             _rate(valid),
             *measured,
-            *([number(_mean(seconds[counted]))] if timed else []),
-            number(_mean(rewards[counted]), 3),
+            *([number(_mean(seconds[counted], on))] if timed else []),
+            number(_mean(rewards[counted], on), 3),
             percent(best.get(policy)),
             str(sum(row.fallback is not None for row in own)),
             str(sum(row.fallback is not None and row.success for row in valid)),
@@ -98,12 +96,7 @@ _MEASURES = {"subgoals": ("subgoals", 2), "score": ("score", 4), "steps": ("step
 
 
 def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
-    table = Table(title="success [95%] by kind of instance", title_justify="left")
-    table.add_column("by")
-    table.add_column("")
-    table.add_column("instances", justify="right")
-    for policy in policies:
-        table.add_column(policy, justify="right")
+    table = Table("success [95%] by kind of instance", ["by", ""], ["instances", *policies])
     kinds: dict[str, int] = {}
     for name, key in SPLITS.items():
         parts: dict[str, list[Row]] = defaultdict(list)
@@ -118,7 +111,7 @@ def _split(rows: Sequence[Row], policies: Sequence[str]) -> Table:
             continue  # shown already
         for value, part in sorted(parts.items()):
             rates = [_rate([row for row in part if row.policy == policy and row.error is None]) for policy in policies]
-            table.add_row(name, value, str(len({row.instance for row in part})), *rates)
+            table.add(name, value, str(len({row.instance for row in part})), *rates)
         table.add_section()
     return table
 
@@ -129,13 +122,16 @@ def _rate(valid: Sequence[Row]) -> str:
     by_instance: dict[str, list[float]] = defaultdict(list)
     for row in valid:
         by_instance[row.instance].append(credited(row, "success"))
-    rate = sum(sum(successes) for successes in by_instance.values()) / len(valid)
-    trials = effective_trials([float(np.mean(successes)) for successes in by_instance.values()], len(valid))
+    rates = [float(np.mean(successes)) for successes in by_instance.values()]
+    rate, trials = float(np.mean(rates)), effective_trials(rates, len(valid))
     return percent(rate, wilson_interval(min(rate * trials, trials), trials))
 
 
-def _mean(values: ArrayLike) -> float | None:
-    """Mean of what is known: neither None nor NaN."""
+def _mean(values: ArrayLike, instances: Sequence[str]) -> float | None:
+    """Mean over instances (n,) of the means of what is known of each, neither None nor NaN: as the page has it, whatever the repeats."""
     numbers = np.asarray(values, np.float64)
-    known = numbers[np.isfinite(numbers)]
-    return float(known.mean()) if known.size else None
+    known = np.isfinite(numbers)
+    if not known.any():
+        return None
+    _, at = np.unique(np.asarray(instances)[known], return_inverse=True)
+    return float((np.bincount(at, numbers[known]) / np.bincount(at)).mean())

@@ -11,12 +11,20 @@ from osel_sim.core import content
 from osel_sim.core.docstrings import field_docstrings
 from osel_sim.core.files import write_json
 from osel_sim.formats.catalogue import CatalogueFile
+from osel_sim.formats.dataset_mapping import DatasetMapping
 from osel_sim.formats.policy_file import PolicyFile
 from osel_sim.formats.task_schema import TaskFile
 from osel_sim.ingestion.columns_schema import ColumnsFile
 from osel_sim.training.recipe import RecipeFile
 
-MODELS: dict[str, Any] = {"task": TaskFile, "policy": PolicyFile, "catalogue": CatalogueFile, "recipe": RecipeFile, "table-mapping": ColumnsFile}
+MODELS: dict[str, Any] = {
+    "task": TaskFile,
+    "policy": PolicyFile,
+    "catalogue": CatalogueFile,
+    "recipe": RecipeFile,
+    "table-mapping": ColumnsFile,
+    "dataset-mapping": DatasetMapping,
+}
 
 
 class _Schema(GenerateJsonSchema):

@@ -27,7 +27,7 @@ class ContextCache:
 
     Args:
         folder: where `contexts.npz` lies or will lie.
-        autosave: write the file whenever that many new contexts came in (0: only on `save`).
+        autosave: write the file whenever that many new contexts came in, and a twentieth of those that are there (0: only on `save`).
         mend: begin anew, with a warning, where the file that is there is damaged: for those who can make the contexts again.
 
     Raises:
@@ -95,7 +95,7 @@ class ContextCache:
             raise UsageError(f"contexts of encoder {encoder!r} have length {len(next(iter(known.values())))}, got {len(context)}")
         known[instance] = context
         self._unsaved += 1
-        if self._autosave and self._unsaved >= self._autosave:
+        if self._autosave and self._unsaved >= max(self._autosave, len(known) // 20):
             self.save()
 
     def encode(self, encoder: Encoder, instance: str, images: Callable[[], Sequence[Image]], instruction: str) -> Context:
@@ -136,14 +136,17 @@ def _example(skill: str, row: int) -> str:
 def _read(file: Path) -> dict[str, dict[str, Context]]:
     contexts: dict[str, dict[str, Context]] = {}
     arrays = read_arrays(file, "contexts")
-    for key, instances in arrays.items():
-        encoder, _, part = key.rpartition("|")
-        if part != "instances":
-            continue
-        table = arrays.get(f"{encoder}|contexts")
-        if table is None:
-            raise DataError(f"{file}: not a file of contexts ({encoder!r} has instances and no contexts)")
+    encoders = {key.rpartition("|")[0] for key in arrays}
+    if arrays.keys() != {f"{encoder}|{part}" for encoder in encoders for part in ("instances", "contexts")}:
+        raise DataError(f"{file}: not a file of contexts (each encoder has instances and contexts, it has {', '.join(sorted(arrays))[:200]})")
+    for encoder in sorted(encoders):
+        instances, table = arrays[f"{encoder}|instances"], arrays[f"{encoder}|contexts"]
         if instances.dtype.kind != "U" or table.dtype != np.float32 or table.ndim != 2 or instances.shape != table.shape[:1]:
             raise DataError(f"{file}: {encoder}: expected (N,) unicode and (N, d) float32, got {instances.dtype} and {table.dtype} {table.shape}")
+        wrong = instances[~np.isfinite(table).all(axis=1)].tolist()
+        if wrong or not table.shape[1]:
+            raise DataError(f"{file}: {encoder}: the context of {', '.join(wrong[:3]) or 'every instance'} is not all finite numbers")
+        if len(np.unique(instances)) < len(instances):
+            raise DataError(f"{file}: {encoder}: an instance has two contexts")
         contexts[encoder] = {str(instance): row for instance, row in zip(instances, table, strict=True)}
     return contexts

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER, PLUGINS, OpenClipEncoder, embedded_encoders, load_open_clip
+from osel_sim.context.names import DEFAULT_ENCODER, PLUGINS, embedded_encoders
+from osel_sim.context.open_clip_encoder import OpenClipEncoder, load_open_clip
 from osel_sim.context.text_encoders import SENTENCE, TFIDF, TextOnly, load_text_encoder
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.encoder import Encoder, Image

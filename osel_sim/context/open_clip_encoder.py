@@ -5,7 +5,7 @@ import logging
 import textwrap
 import warnings
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
@@ -13,26 +13,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.core.content import root
+from osel_sim.context.names import CONFIG, DEFAULT_ENCODER, PLUGINS, embedded_encoders
 from osel_sim.core.errors import CheckpointError, UnknownNameError, UsageError, nearest
 from osel_sim.core.files import file_digest, read_json
 from osel_sim.core.hub import offline_if_unreachable, why_silent
-from osel_sim.core.registry import Registry
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
-from osel_sim.interface.encoder import Context, Encoder, Image
+from osel_sim.interface.encoder import Context, Image
 
-DEFAULT_ENCODER = "osel_small"
 WEIGHTS = "open_clip_model.safetensors"
-CONFIG = "open_clip_config.json"
 VOCABULARY = "bpe_vocabulary.txt.gz"
-PLUGINS = Registry[Callable[[], Encoder]]("encoder", "osel_sim.encoders", {})
-"""Encoders of other packages."""
 MAX_VOCABULARY = 16 << 20  # bytes, inflated; CLIP's own has 3 MB
-
-
-def embedded_encoders() -> dict[str, Path]:
-    """Name -> folder of the encoders that come with the package, no download needed."""
-    return {config.parent.name: config.parent for config in sorted((root() / "assets" / "encoders").glob(f"*/{CONFIG}"))}
 
 
 def load_open_clip(name: str, device: str = "cpu") -> "OpenClipEncoder":

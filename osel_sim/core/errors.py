@@ -72,6 +72,12 @@ class DataError(OselError):
     """A journal, rollout log or dataset cannot be read or does not have the promised form."""
 
 
+class DivergedError(OselError):
+    """A training's loss or gradient is no finite number any more."""
+
+    exit_code = 1
+
+
 class WorkerError(OselError):
     """Worker processes keep dying, so the work cannot go on. The message names how the last one ended."""
 

@@ -117,7 +117,7 @@ def read_json(file: Path, hint: str = "") -> dict[str, Any]:
         DataError: the file is missing or holds something else.
     """
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
+        data = json.loads(file.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise DataError(f"{file} cannot be read as JSON ({error})" + (f"; {hint}" if hint else "")) from None
     except (ValueError, RecursionError) as error:

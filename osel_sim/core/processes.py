@@ -61,7 +61,7 @@ class Lost[J]:
 
 
 def run_jobs[J, R](
-    setup: Setup[J, R], jobs: Sequence[J], workers: int, results: Callable[[J], int] = lambda job: 1
+    setup: Setup[J, R], jobs: Sequence[J], workers: int, results: Callable[[J], int] = lambda job: 1, ready: Callable[[], None] = lambda: None
 ) -> Generator[Result[J, R] | Lost[J], None, None]:
     """Work on jobs in worker processes. What comes of them does not depend on how many there are, only the order does.
 
@@ -71,6 +71,7 @@ def run_jobs[J, R](
         setup: picklable, as everything that goes to or comes from a worker; what `__main__` defines travels by value.
         workers: at most so many processes.
         results: how many results a job has.
+        ready: called when the first worker is set up.
 
     Yields:
         all results of all jobs, those of one job in order; `Lost` where there is none.
@@ -79,7 +80,7 @@ def run_jobs[J, R](
         Exception: `setup` raised it before any worker was ready.
         WorkerError: three jobs in a row lost a result, or no worker starts.
     """
-    pool = _Pool[J, R](cloudpickle.dumps(setup), [_Task(job, results(job)) for job in jobs], workers)
+    pool = _Pool[J, R](cloudpickle.dumps(setup), [_Task(job, results(job)) for job in jobs], workers, ready)
     try:
         yield from pool.work()
     finally:
@@ -150,7 +151,8 @@ class _Worker:
 
 
 class _Pool[J, R]:
-    def __init__(self, setup: bytes, tasks: Sequence[_Task[J]], workers: int) -> None:
+    def __init__(self, setup: bytes, tasks: Sequence[_Task[J]], workers: int, ready: Callable[[], None]) -> None:
+        self._ready = ready
         self._setup, self._todo, self._unfinished = setup, deque(tasks), len(tasks)
         self._workers = [_Worker() for _ in range(min(workers, len(tasks)))]
         self._begun = False  # some worker was ready once
@@ -178,6 +180,8 @@ class _Pool[J, R]:
             return
         match message:
             case Ready():
+                if not self._begun:
+                    self._ready()
                 worker.ready, worker.failed_starts, self._begun = True, 0, True
                 self._staff()
             case Value(value) if worker.task is not None:

@@ -62,5 +62,5 @@ class TensorFile:
                     raise DataError(f"{file}: not a {self.what} (format {metadata.get('format')!r}, expected {self.format!r})")
                 arrays = {name: handle.get_tensor(name) for name in handle.keys()}  # noqa: SIM118 (a file handle, not a dict)
             return arrays, dict(json.loads(metadata["values"]))
-        except (OSError, SafetensorError, KeyError, ValueError, TypeError) as error:
+        except (OSError, SafetensorError, KeyError, ValueError, TypeError, RecursionError) as error:
             raise DataError(f"{file}: {self.what} cannot be read ({error})") from None

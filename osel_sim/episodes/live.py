@@ -16,19 +16,16 @@ from osel_sim.episodes.loop import run_episode
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
 from osel_sim.episodes.view import view
-from osel_sim.formats.journal import Decision, Lines, to_decision
+from osel_sim.formats.counterfactual import COUNTERFACTUAL, Others, to_others
+from osel_sim.formats.journal import JOURNAL, SEEDS_PER_RUN, TIMING, Decision, Lines, as_read, check_beside, read_lines, to_decision
+from osel_sim.formats.summary import check_summary
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.selector import Choice, Selector
 from osel_sim.interface.suite import Task
-from osel_sim.selection.reward import RewardWeights, reward
+from osel_sim.selection.reward import RewardWeights, check_reward, reward
 from osel_sim.suites.open_tasks import OpenTasks
-
-SEEDS_PER_RUN = 1_000_000
-"""Decision t of run seed s is made on the instance of seed s * 1,000,000 + t: no two runs share an instance."""
-
-JOURNAL, COUNTERFACTUAL = "episodes.jsonl", "counterfactual.jsonl"
 
 
 @dataclass(frozen=True)
@@ -55,12 +52,17 @@ class LiveOptions:
 class LiveRun:
     """One run in one folder. Made on a folder with a journal, it learns from that first and goes on after it. Close it.
 
+    What the folder holds is looked at before any of it is changed.
+
     Args:
         subscribers: watch it (`osel_sim.episodes.run_subscribers`); the run itself writes its journal, counterfactual outcomes and contexts only.
 
     Attributes:
         decisions: all so far.
         rewards: of every policy (columns) in every decision (rows), NaN where there is none; only chosen ones without `counterfactual`.
+
+    Raises:
+        DataError: the folder's files are damaged, or do not fit together.
     """
 
     def __init__(
@@ -76,9 +78,13 @@ class LiveRun:
         self.folder, self.tasks, self.encoder = folder, tasks, encoder
         self.drivers, self.selector, self.options = drivers, selector, options
         self.subscribers = subscribers
-        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder, mend=True)
+        # Contexts are on disk about as soon as their decisions: a run that goes on, or was killed, can be reported on.
+        self.envs, self.cache = OpenTasks(tasks), ContextCache(folder, autosave=1, mend=True)
+        self.decisions = [to_decision(data, index, folder / JOURNAL) for index, (data, _) in enumerate(read_lines(folder / JOURNAL))]
+        check_beside(folder / COUNTERFACTUAL, len(self.decisions), complete=options.counterfactual)
+        check_beside(folder / TIMING, len(self.decisions))
+        check_summary(folder, len(self.decisions))
         self._journal = Lines(folder / JOURNAL)
-        self.decisions = [to_decision(data, index, self._journal.file) for index, (data, _) in enumerate(self._journal.rows)]
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
         self._rows: list[list[float]] = []
 
@@ -113,10 +119,11 @@ class LiveRun:
         """Let the selector live through the journal, so that it is what it was when the run was cut off.
 
         Raises:
-            DataError: the selector decides otherwise than the journal says, or a line about the other policies is missing.
+            DataError: the selector decides otherwise than the journal says, or a line is not of the run's instance, or its reward is wrong.
         """
         for decision in self.decisions:
             instance = self._instance(decision.index)
+            self._check(decision, instance)
             context = self._context(instance, loaded=False)
             choice = self.selector.select(context)
             if choice.policy != decision.policy or choice.propensities != decision.propensities:
@@ -127,9 +134,8 @@ class LiveRun:
             self._learn(context, choice, decision.reward)
             known = {decision.policy: decision.reward}
             if self._others is not None:
-                if decision.index >= len(self._others.rows):
-                    raise DataError(f"{self._others.file}: line {decision.index + 1} is missing, which the journal has")
-                known |= {name: other["reward"] for name, other in self._others.rows[decision.index][0]["policies"].items()}
+                others = self._checked_others(self._others.rows[decision.index][0], decision.index, decision.policy)
+                known |= others.rewards
             self._remember(known)
 
     def decide(self) -> Decision:
@@ -145,13 +151,15 @@ class LiveRun:
             subscriber.on_choice(index, choice.policy)
         outcome = self._episode(index, instance, start, choice.policy, chosen=True)
         decision = self._decision(index, instance, choice, outcome)
+        # What a suite or a selector of others got wrong is told now, not when the journal is read.
+        to_decision(as_read(decision.to_dict(), f"{self._journal.file}, line {index + 1}"), index, self._journal.file)
         rewards = {choice.policy: decision.reward}
         if self._others is not None:
-            others = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in self.policies if policy != choice.policy}
-            rewards |= {policy: self._reward(other) for policy, other in others.items()}
-            self._others.append(
-                {"index": index, "policies": {policy: {**other.to_dict(), "reward": rewards[policy]} for policy, other in others.items()}}
-            )
+            found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in self.policies if policy != choice.policy}
+            others = Others(index, found, {policy: self._reward(other) for policy, other in found.items()})
+            rewards |= others.rewards
+            self._checked_others(as_read(others.to_dict(), f"{self._others.file}, line {index + 1}"), index, choice.policy)
+            self._others.append(others.to_dict())
         for subscriber in self.subscribers:
             subscriber.on_decision(decision, rewards)
         # The journal comes last: what it does not have did not happen.
@@ -187,6 +195,22 @@ class LiveRun:
         level = options.levels[int(chance.integers(len(options.levels)))]
         return task.instance(options.seed * SEEDS_PER_RUN + index, level, options.split, options.axes)
 
+    def _check(self, decision: Decision, instance: Instance) -> None:
+        """Refuse a decision of the journal that is not about this instance, or has another reward than its outcome comes to."""
+        place = f"{self._journal.file}, line {decision.index + 1}"
+        for name, now in _about(instance).items():
+            if (then := getattr(decision, name)) != now:
+                raise DataError(f"{place}: {name} is {then!r}, of the run's instance it is {now!r}: damaged, or made with other versions")
+        check_reward(decision.reward, decision.outcome, self.options.weights, place)
+
+    def _checked_others(self, data: dict[str, Any], index: int, chosen: str) -> Others:
+        """A line about the policies that were not chosen."""
+        file = self.folder / COUNTERFACTUAL
+        others = to_others(data, index, file, self.policies, chosen)
+        for policy, outcome in others.outcomes.items():
+            check_reward(others.rewards[policy], outcome, self.options.weights, f"{file}, line {index + 1}: {policy}")
+        return others
+
     def _context(self, instance: Instance, loaded: bool) -> NDArray[np.float32]:
         def images() -> list[NDArray[np.uint8]]:
             env = self.envs[instance.task]
@@ -211,20 +235,17 @@ class LiveRun:
         own: dict[str, Any] = {key: value for key, value in vars(outcome).items() if key not in ("fallback", "error")}
         return Decision(
             index=index,
-            task=instance.task,
-            seed=instance.seed,
-            level=instance.level,
-            axes=instance.axes,
-            split=instance.split,
-            instruction=instance.instruction,
-            phrasing=instance.phrasing,
-            target=instance.target,
-            container=instance.container,
             policy=choice.policy,
             propensities=dict(choice.propensities),
             reward=self._reward(outcome),
             fallback=outcome.fallback,
             error=outcome.error,
-            robot=instance.other_robot,
+            **_about(instance),
             **own,
         )
+
+
+def _about(instance: Instance) -> dict[str, Any]:
+    """What a decision says of its instance."""
+    names = ("task", "seed", "level", "axes", "split", "instruction", "phrasing", "target", "container")
+    return {**{name: getattr(instance, name) for name in names}, "robot": instance.other_robot}

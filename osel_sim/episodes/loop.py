@@ -207,7 +207,7 @@ class _Episode:
         )
 
     def _count(self, call: Call) -> None:
-        self.tallies[-1].calls += 1
+        self.tallies[-1].calls += call.sent
         self.tallies[-1].megabytes += call.megabytes
         self.upload += call.upload
         self.inference += call.inference

@@ -30,6 +30,11 @@ class Progress(RunSubscriber):
         self._bar = self._shown.enter_context(progress(self._total, "episode", initial=len(self._seen)))
 
     @override
+    def on_choice(self, index: int, policy: str) -> None:
+        if self._bar is not None:  # by now the environment is open, and what had to be compiled is
+            self._bar.begin()
+
+    @override
     def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:
         self._seen.append(decision)
         if self._bar is not None:

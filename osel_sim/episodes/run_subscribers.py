@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from osel_sim.episodes.loop import Subscriber
 from osel_sim.episodes.subscribers import RealTime, Timing
 from osel_sim.episodes.video import Video
-from osel_sim.formats.journal import Decision, Lines
+from osel_sim.formats.journal import TIMING, Decision, Lines
 
-TIMING, VIDEOS = "timing.jsonl", "videos"
+VIDEOS = "videos"
 
 
 class Run(Protocol):
@@ -127,14 +127,15 @@ class Films(RunSubscriber):
     Args:
         folder: of the run.
         indices: of the decisions.
+        quality: of the rendering, `full` or `fast`.
     """
 
-    def __init__(self, folder: Path, indices: frozenset[int]) -> None:
-        self._folder, self._indices = folder / VIDEOS, indices
+    def __init__(self, folder: Path, indices: frozenset[int], quality: str = "full") -> None:
+        self._folder, self._indices, self._quality = folder / VIDEOS, indices, quality
 
     @override
     def watch(self, index: int, policy: str, chosen: bool) -> Sequence[Subscriber]:
-        return [Video(self._folder / f"{index:05d}-{policy}.mp4")] if chosen and index in self._indices else []
+        return [Video(self._folder / f"{index:05d}-{policy}.mp4", quality=self._quality)] if chosen and index in self._indices else []
 
 
 class Paced(RunSubscriber):

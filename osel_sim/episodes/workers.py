@@ -5,7 +5,8 @@ worker dies as well, it becomes an error row, and a new worker does the rest of 
 """
 
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome, Seconds
-from osel_sim.interface.suite import Task
+from osel_sim.interface.suite import Prepares, Task
 
 if TYPE_CHECKING:
     import numpy as np
@@ -89,10 +90,13 @@ class _Job:
         return self.instance
 
 
-def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int) -> Iterator[Recorded | None]:
+def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int, begun: Callable[[], None] = lambda: None) -> Iterator[Recorded | None]:
     """Record these episodes, by instance, each instance yielded when all of its are there, in no particular order; None for every episode in between.
 
     Every instance gets its context as well, also one without episodes.
+
+    Args:
+        begun: called when all is loaded and the first episode begins.
 
     Raises:
         OselError: a policy or the encoder cannot be loaded.
@@ -101,8 +105,13 @@ def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int) -
     jobs = [_Job(instance, tuple(episodes)) for instance, episodes in missing.items()]
     under_way = {job.instance: Recorded(job.instance) for job in jobs}
     made, cause = 0, ""
+    for suite in {id(task.suite): task.suite for task in plan.tasks}.values():
+        if isinstance(suite, Prepares):
+            suite.prepare()  # here, once, rather than in every worker
     with closing(run_jobs(functools.partial(_recorder, plan), jobs, workers, lambda job: 1 + len(job.episodes))) as events:
-        for event in events:
+        for number, event in enumerate(events):
+            if number == 0:
+                begun()
             job, recorded = event.job, under_way[event.job.instance]
             if event.index == 0:
                 recorded.context = event.value if isinstance(event, Result) else None
@@ -122,8 +131,6 @@ def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int) -
 
 def _recorder(plan: Plan) -> Work[_Job, Any]:
     """What a worker does: load encoder, policies and servers, then instance by instance."""
-    import torch
-
     from osel_sim.context.encoder import load_encoder
     from osel_sim.episodes.drivers import Drivers
     from osel_sim.episodes.loop import run_episode
@@ -132,8 +139,9 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
     from osel_sim.suites.open_tasks import OpenTasks
     from osel_sim.suites.registry import common_specification
 
-    torch.set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
     encoder, drivers = load_encoder(plan.encoder), Drivers(plan.everyone, common_specification(plan.tasks))
+    if "torch" in sys.modules:  # importing it takes longer than an episode, and not every encoder and policy needs it
+        sys.modules["torch"].set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
     envs = OpenTasks(plan.tasks, keep=2)  # work comes task by task
 
     def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | Row]":

@@ -16,9 +16,18 @@ from typing import Any
 
 from osel_sim.core.errors import DataError
 from osel_sim.core.shown import escaped
+from osel_sim.formats.toml_types import quoted
+from osel_sim.formats.values import DECISION, fault
+from osel_sim.interface.instance import instance_key, label
 from osel_sim.interface.outcome import Outcome, Seconds
 
 logger = logging.getLogger(__name__)
+JOURNAL, TIMING = "episodes.jsonl", "timing.jsonl"
+LOST = "the journal lost decisions; put it back, or give another folder with --out"
+"""What a journal is told that is shorter than what lies beside it."""
+
+SEEDS_PER_RUN = 1_000_000
+"""Decision t of run seed s is made on the instance of seed s * 1,000,000 + t: no two runs share an instance."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +73,11 @@ class Decision:
         return {key: value for key, value in data.items() if value is not None or key not in ("robot", "fallback_steps")}
 
     @property
+    def instance(self) -> str:
+        """Key of its instance."""
+        return instance_key(self.task, self.split, label(self.level, self.axes), self.seed, self.robot)
+
+    @property
     def outcome(self) -> Outcome:
         """What came of it, without what it was about."""
         return Outcome(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Outcome)})
@@ -81,6 +95,18 @@ def to_line(data: dict[str, Any]) -> str:
         ValueError: a NaN or infinity, which JSON does not have.
     """
     return escaped(json.dumps(data, allow_nan=False, ensure_ascii=False, separators=(", ", ": "))) + "\n"
+
+
+def as_read(data: dict[str, Any], place: str) -> dict[str, Any]:
+    """Data as its line will be read again.
+
+    Raises:
+        DataError: naming the place, of what no line of JSON holds.
+    """
+    try:
+        return dict(json.loads(to_line(data)))
+    except (ValueError, TypeError) as error:
+        raise DataError(f"{place}: cannot be written ({error})") from None
 
 
 class Lines:
@@ -124,17 +150,36 @@ def read_lines(file: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
     Raises:
         DataError: naming file and line.
     """
-    raw = file.read_bytes() if file.exists() else b""
-    for number, line in enumerate(raw.splitlines(keepends=True), 1):
-        if not line.endswith(b"\n"):
-            return
-        try:
-            data = json.loads(line)
-        except (ValueError, RecursionError) as error:
-            raise DataError(f"{file}, line {number}: not JSON ({error})") from None
-        if not isinstance(data, dict):
-            raise DataError(f"{file}, line {number}: expected an object, got {type(data).__name__}")
-        yield data, line
+    try:
+        raw = file.read_bytes() if file.exists() else b""
+    except OSError as error:
+        raise DataError(f"{file} cannot be read ({error.strerror or error})") from None
+    *lines, torn = raw.split(b"\n")
+    for number, line in enumerate(lines, 1):
+        yield _parsed(line, f"{file}, line {number}"), line + b"\n"
+    if _continues(torn):
+        raise DataError(f"{file}, line {len(lines) + 1}: something follows the decision; a line that was cut off ends before its end")
+
+
+def check_beside(file: Path, decisions: int, complete: bool = False) -> None:
+    """Refuse a file that has a line for each decision, and does not fit the journal beside it.
+
+    Its line is written before the journal's, so a run that was killed leaves it one line longer at most. A journal that is much shorter has lost
+    decisions, and going on would overwrite what is left of them.
+
+    Args:
+        decisions: of the journal.
+        complete: refuse one that is shorter as well.
+
+    Raises:
+        DataError: naming the file.
+    """
+    # What is not needed whole is counted, not read: it may be damaged, and is mended.
+    lines = sum(1 for _ in read_lines(file)) if complete else file.read_bytes().count(b"\n") if file.exists() else 0
+    if lines > decisions + 1:
+        raise DataError(f"{file} has {lines} lines, {JOURNAL} beside it {decisions}: {LOST}")
+    if complete and lines < decisions:
+        raise DataError(f"{file}: line {lines + 1} is missing, which the journal has")
 
 
 def to_decision(data: dict[str, Any], index: int, file: Path) -> Decision:
@@ -143,12 +188,16 @@ def to_decision(data: dict[str, Any], index: int, file: Path) -> Decision:
     Raises:
         DataError: naming file and line.
     """
-    try:
-        decision = Decision.from_dict(data)
-    except (TypeError, KeyError) as error:
-        raise DataError(f"{file}, line {index + 1}: not a decision ({error})") from None
+    place = f"{file}, line {index + 1}"
+    if problem := fault(data, DECISION, optional=("robot", "fallback_steps")):
+        raise DataError(f"{place}: not a decision ({problem})")
+    decision = Decision.from_dict(data)
     if decision.index != index:
-        raise DataError(f"{file}, line {index + 1}: index must be {index}, got {decision.index}")
+        raise DataError(f"{place}: index must be {index}, got {decision.index}")
+    if decision.policy not in decision.propensities:
+        raise DataError(f"{place}: {quoted(decision.policy)} is no policy of the run, or has no propensity")
+    if (decision.reward is None) != (decision.error is not None):
+        raise DataError(f"{place}: reward must be {'a number' if decision.error is None else 'null beside an error'}, got {decision.reward}")
     return decision
 
 
@@ -159,8 +208,39 @@ def read_journal(file: Path) -> list[Decision]:
         DataError: the file is missing or not a journal.
     """
     if not file.is_file():
-        raise DataError(f"{file} does not exist; a run writes it as episodes.jsonl")
+        raise DataError(f"{file} does not exist; a run writes it as {JOURNAL}")
     return [to_decision(data, index, file) for index, (data, _) in enumerate(read_lines(file))]
+
+
+def _parsed(line: bytes, place: str) -> dict[str, Any]:
+    try:
+        data = json.loads(line.decode(), object_pairs_hook=_object, parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{place}: not JSON ({error})") from None
+    if not isinstance(data, dict):
+        raise DataError(f"{place}: expected an object, got {type(data).__name__}")
+    return data
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError("a key is there twice")
+    return found
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON")
+
+
+def _continues(torn: bytes) -> bool:
+    """Whether a last line without its end goes on after a whole object: a killed process does not leave that."""
+    text = torn.decode(errors="replace")
+    try:
+        _, end = json.JSONDecoder().raw_decode(text)
+    except (ValueError, RecursionError):
+        return False
+    return end < len(text)
 
 
 def _sync_folder(folder: Path) -> None:

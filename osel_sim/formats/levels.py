@@ -1,13 +1,10 @@
-"""Levels and axes: how far an instance is perturbed, and in what. Level 0 is clean; levels 1 to 3 turn up every axis a task allows, or one alone.
-
-Also the key of an instance, which says all that fixes it.
-"""
+"""Levels and axes: how far an instance is perturbed, and in what. Level 0 is clean; levels 1 to 3 turn up every axis a task allows, or one alone."""
 
 from collections.abc import Iterable, Mapping
 
 from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.interface.instance import instance_key as instance_key
 from osel_sim.interface.instance import label as label
-from osel_sim.interface.robot import DEFAULT_ROBOT
 
 LEVELS = (0, 1, 2, 3)
 AXES = ("light", "camera", "texture", "distractors", "colours", "sizes", "start", "robot", "phrasing")
@@ -64,16 +61,6 @@ def split_off(levels: Mapping[str, int]) -> tuple[int, str | None]:
     level = min(levels.values(), default=0)
     above = ",".join(f"{axis}={own}" for axis, own in sorted(levels.items()) if own > level)
     return level, above or None
-
-
-def instance_key(task: str, split: str, perturbed: str, seed: int, robot: str | None = None) -> str:
-    """`pick_place/test/2/7`, or `pick_place/test/2/7-UR5e` for another robot than the usual one.
-
-    Args:
-        perturbed: as `label` gives it.
-        robot: None is the usual one.
-    """
-    return f"{task}/{split}/{perturbed}/{seed}" + ("" if robot in (None, DEFAULT_ROBOT) else f"-{robot}")
 
 
 def _check(axis: str, level: int, known: Iterable[str] = AXES) -> None:

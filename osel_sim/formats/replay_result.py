@@ -32,14 +32,14 @@ class Choices:
         policies: (P,) names.
         order: int32 (S, T), index into `instances`: which instance was decided on when.
         repeats: int16 (S, T, P), which repeat's outcome (last axis of `LoggedOutcomes`) counted for each policy; the same for all selectors.
-        chosen: selector -> int8 (S, T), index into `policies`.
+        chosen: selector -> int16 (S, T), index into `policies`.
     """
 
     instances: tuple[str, ...]
     policies: tuple[str, ...]
     order: NDArray[np.int32]
     repeats: NDArray[np.int16]
-    chosen: dict[str, NDArray[np.int8]]
+    chosen: dict[str, NDArray[np.int16]]
 
     def outcomes(self, table: NDArray[np.float64]) -> NDArray[np.float64]:
         """What each policy's outcome was in each decision, (S, T, P).
@@ -142,7 +142,7 @@ def _npz(choices: Choices) -> bytes:
         "policies": np.array(choices.policies, np.str_),
         "order": choices.order.astype(np.int32),
         "repeats": choices.repeats.astype(np.int16),
-        **{_PREFIX + name: chosen.astype(np.int8) for name, chosen in choices.chosen.items()},
+        **{_PREFIX + name: chosen.astype(np.int16) for name, chosen in choices.chosen.items()},
     }
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)

@@ -10,14 +10,18 @@ null.
 """
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.core.arrays import check_rows, local
+from osel_sim.core.arrays import check_rows
 from osel_sim.core.errors import DataError
-from osel_sim.core.files import atomic
+from osel_sim.core.files import atomic, content_digest
+from osel_sim.formats.toml_types import plain_name, quoted
+from osel_sim.formats.values import NAME, ROW, TEXTS
+from osel_sim.interface.instance import instance_key, label
 from osel_sim.interface.outcome import Outcome, Seconds
 
 if TYPE_CHECKING:
@@ -27,9 +31,14 @@ SCHEMA_VERSION = 4
 _COLUMNS_ADDED = {2: ("score", "axes"), 3: ("robot",), 4: ("fallback_steps",)}
 """Columns that came with a version; logs of an earlier one are read without them."""
 ROLLOUTS = "rollouts.parquet"
+PROPENSITIES = "propensities"
+"""Key in a log's metadata: with which probability the policy of each row was chosen, where the log is of decisions (logged bandit data)."""
 DECLARED = "skills"
 """Key of the metadata that says what policies declare: policy -> names of skills. Examples of them lie among the contexts."""
-_PREFIX = b"osel_sim."
+_PREFIX, _CHECKSUM = b"osel_sim.", "checksum"
+_ABOUT = ("task", "seed", "level", "split", "axes", "robot", "instruction", "phrasing", "target", "container")
+"""Columns that are the same in all rows of an instance."""
+_about = attrgetter(*_ABOUT)
 
 
 @dataclass(frozen=True)
@@ -118,14 +127,14 @@ def write_rollouts(folder: Path, rows: Iterable[Row], metadata: dict[str, Any]) 
     # A log of the usual robot alone, without fallbacks, stays one that earlier versions of osel_sim read.
     needed = (since for since, names in _COLUMNS_ADDED.items() if any(getattr(row, name) is not None for row in rows for name in names))
     version = max([2, *needed])
-    extra = {**metadata, "schema_version": version}
+    extra = {**metadata, "schema_version": version, _CHECKSUM: _checksum(metadata)}
     annotated = schema(version).with_metadata(
         {_PREFIX + key.encode(): json.dumps(value, sort_keys=True).encode() for key, value in sorted(extra.items())}
     )
     table = pyarrow.Table.from_pylist([vars(row) for row in rows], schema=annotated)
     file = folder / ROLLOUTS
     with atomic(file) as partial:
-        pyarrow.parquet.write_table(table, local(partial), compression="zstd")
+        pyarrow.parquet.write_table(table, partial.absolute(), compression="zstd", write_page_checksum=True)
     return file
 
 
@@ -145,28 +154,95 @@ def read_rollouts(folder: Path) -> tuple[list[Row], dict[str, Any]]:
             "the same command goes on with an interrupted one"
         )
     try:
-        found = pyarrow.parquet.read_schema(local(file))
+        found = pyarrow.parquet.read_schema(file.absolute())
         check_rows(file)
-    except (pyarrow.ArrowException, OSError) as error:
-        raise DataError(f"{file} is not a Parquet file ({error})") from None
-    raw = found.metadata or {}
-    try:
-        metadata = {key.removeprefix(_PREFIX).decode(): json.loads(value) for key, value in raw.items() if key.startswith(_PREFIX)}
-    except ValueError as error:
-        raise DataError(f"{file}: its metadata cannot be read ({error})") from None
-    version = metadata.get("schema_version")
-    if not isinstance(version, int) or not 1 <= version <= SCHEMA_VERSION:
-        raise DataError(f"{file}: osel_sim.schema_version must be 1 to {SCHEMA_VERSION}, got {version}")
-    columns = schema(version).names
-    if found.names != columns:
-        raise DataError(f"{file}: columns must be {', '.join(columns)}; got {', '.join(found.names)}")
+        names = list(found.names)
+    except DataError:
+        raise
+    except Exception as error:  # of damaged bytes pyarrow says different things, UnicodeDecodeError among them
+        raise DataError(f"{file} is not a Parquet file ({_in_one_line(error)})") from None
+    metadata = _metadata(file, found.metadata or {})
+    columns = schema(metadata["schema_version"]).names
+    if names != columns:
+        raise DataError(f"{file}: columns must be {', '.join(columns)}; got {', '.join(map(plain_name, names))}")
     _check_types(file, found)
     try:
-        table = pyarrow.parquet.read_table(local(file))
+        # Logs of earlier versions have no checksums; types and ranges are all that tells damage there.
+        table = pyarrow.parquet.read_table(file.absolute(), page_checksum_verification=True)
         table.validate(full=True)  # text is UTF-8
-    except (pyarrow.ArrowException, OSError) as error:
-        raise DataError(f"{file} is not a whole Parquet file ({' '.join(str(error).split())})") from None
-    return [Row(**row) for row in _checked(file, table).to_pylist()], metadata
+        if (claimed := pyarrow.parquet.read_metadata(file.absolute()).num_rows) != table.num_rows:
+            raise DataError(f"{file}: claims {claimed} rows, has {table.num_rows}")
+        values = _checked(file, table).to_pylist()
+    except DataError:
+        raise
+    except Exception as error:
+        raise DataError(f"{file} is not a whole Parquet file ({_in_one_line(error)})") from None
+    _check_values(file, values)
+    rows = [Row(**row) for row in values]
+    _check_together(file, rows)
+    return rows, metadata
+
+
+def row_fault(row: Row) -> str | None:
+    """What does not fit together in a row whose fields are right one by one; None where all does."""
+    if row.seed is None or row.level is None or row.split is None:
+        return None  # from elsewhere
+    key = instance_key(row.task, row.split, label(row.level, row.axes), row.seed, row.robot)
+    return None if row.instance == key else f"instance must be {key!r}, which its task, split, level, axes, seed and robot make, got {row.instance!r}"
+
+
+def _metadata(file: Path, raw: dict[bytes, bytes]) -> dict[str, Any]:
+    try:
+        metadata = {key.removeprefix(_PREFIX).decode(): json.loads(value) for key, value in raw.items() if key.startswith(_PREFIX)}
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{file}: its metadata cannot be read ({error})") from None
+    version = metadata.get("schema_version")
+    if not isinstance(version, int) or isinstance(version, bool) or not 1 <= version <= SCHEMA_VERSION:
+        raise DataError(f"{file}: osel_sim.schema_version must be 1 to {SCHEMA_VERSION}, got {version}")
+    written = metadata.pop(_CHECKSUM, None)  # logs of earlier versions have none
+    if written is not None and written != _checksum(metadata):
+        raise DataError(f"{file}: its metadata is damaged: it does not fit its checksum")
+    policies, encoder = metadata.get("policies", []), metadata.get("encoder")
+    if not isinstance(policies, list) or not all(map(NAME.fits, policies)):
+        raise DataError(f"{file}: policies in its metadata must be a list of names, got {quoted(policies)}")
+    if not TEXTS.fits(metadata.get("content") or {}):
+        raise DataError(f"{file}: content in its metadata must be {TEXTS.wanted}, got {quoted(metadata['content'])}")
+    if not NAME.or_null.fits(encoder):
+        raise DataError(f"{file}: encoder in its metadata must be {NAME.or_null.wanted}, got {quoted(encoder)}")
+    return metadata
+
+
+def _check_values(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    for name, kind in ROW.items():
+        column = [row.get(name) for row in rows]
+        if not all(map(kind.fits, set(column))):  # columns repeat few values over and over
+            number, value = next((number, value) for number, value in enumerate(column, 1) if not kind.fits(value))
+            raise DataError(f"{file}: column {name!r}, row {number}: must be {kind.wanted}, got {quoted(value)}")
+
+
+def _check_together(file: Path, rows: Sequence[Row]) -> None:
+    """Refuse an episode that is there twice, and rows of one instance that say different things of it."""
+    seen, first = set[tuple[str, str, int]](), dict[str, Row]()
+    for number, row in enumerate(rows, 1):
+        if (episode := (row.instance, row.policy, row.repeat)) in seen:
+            raise DataError(f"{file}: row {number}: instance {row.instance!r}, policy {row.policy!r}, repeat {row.repeat} is there twice")
+        seen.add(episode)
+        if row.instance not in first:
+            first[row.instance] = row
+            if problem := row_fault(row):
+                raise DataError(f"{file}: row {number}: {problem}")
+        elif _about(row) != _about(first[row.instance]):
+            name, was, now = next(item for item in zip(_ABOUT, _about(first[row.instance]), _about(row), strict=True) if item[1] != item[2])
+            raise DataError(f"{file}: row {number}: instance {row.instance!r}: its {name} is {quoted(now)}, in an earlier row it is {quoted(was)}")
+
+
+def _in_one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+def _checksum(metadata: Mapping[str, Any]) -> str:
+    """Of the metadata: the checksums of a Parquet file's pages are of its columns only."""
+    return content_digest(json.dumps({key: value for key, value in metadata.items() if key not in ("schema_version", _CHECKSUM)}, sort_keys=True))
 
 
 def _check_types(file: Path, found: "pyarrow.Schema") -> None:
@@ -200,7 +276,6 @@ def _checked(file: Path, table: "pyarrow.Table") -> "pyarrow.Table":
         refuse(name, table[name].is_null(), "is empty, every row needs one")
     missing = table["success"].is_null()
     refuse("success", pyarrow.compute.and_(missing, table["error"].is_null()), "is empty, and error does not say why")
-    refuse("repeat", pyarrow.compute.less(table["repeat"], 0), "must be 0 or more")
     success = pyarrow.compute.fill_null(table["success"].cast(pyarrow.bool_()), False)
     return table.set_column(table.schema.get_field_index("success"), "success", success)
 

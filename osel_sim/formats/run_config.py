@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from osel_sim.core import content
-from osel_sim.core.errors import UsageError
+from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import digest, is_partial, read_json, write_json
 from osel_sim.core.holding import LOCK
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.formats.toml_types import quoted
+from osel_sim.formats.values import TEXTS
 from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.interface.suite import Task
 
@@ -26,6 +28,26 @@ RUN = "run.json"
 UNSAID = ("robot",)
 """Keys of a configuration that are left out where they say what is usual; they are compared all the same."""
 LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """What a run's or a recording's `run.json` holds: `configuration` and `environment` are objects.
+
+    Raises:
+        DataError: it is missing, of another version or of another form.
+    """
+    file = folder / RUN
+    data = read_json(file)
+    version = data.get("schema_version")
+    if version != SCHEMA_VERSION or isinstance(version, bool):
+        raise DataError(f"{file}: schema_version must be {SCHEMA_VERSION}, got {quoted(version)}")
+    for key in ("configuration", "environment"):
+        if not isinstance(data.setdefault(key, {}), dict):
+            raise DataError(f"{file}: {key} must be an object, got {quoted(data[key])}")
+    for key, name in (("configuration", "content"), ("environment", "versions")):
+        if not TEXTS.fits(data[key].get(name) or {}):
+            raise DataError(f"{file}: {key}.{name} must be {TEXTS.wanted}, got {quoted(data[key][name])}")
+    return data
 
 
 def environment(gl: str, root: Path, packages: Iterable[str] = ()) -> dict[str, Any]:
@@ -113,7 +135,7 @@ def check_run_folder(folder: Path, configuration: dict[str, Any], resume: bool) 
         return
     if not resume:
         raise UsageError(f"--out {folder} is in use; add --resume to go on with what is in it, or give another folder")
-    was = read_json(file).get("configuration", {})
+    was = read_run(folder)["configuration"]
     now = {**dict.fromkeys(UNSAID), **configuration} if configuration else {}
     _compare(file, {key: was.get(key) for key in now}, json.loads(json.dumps(now)))
 
@@ -157,7 +179,7 @@ def start_or_resume(
         except OSError as error:
             raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
         return []
-    was = read_json(file).get("environment", {})
+    was = read_run(folder)["environment"]
     if was.get("gl") != ran_with["gl"]:
         raise UsageError(f"{file}: it began with the GL backend {was.get('gl')!r}, now it is {ran_with['gl']!r}; set MUJOCO_GL={was.get('gl')}")
     return [

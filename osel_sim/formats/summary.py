@@ -1,11 +1,16 @@
 """`summary.json`: what a live run came to."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
-from osel_sim.formats.journal import Decision
+from osel_sim.core.errors import DataError
+from osel_sim.core.files import read_json
+from osel_sim.formats.journal import JOURNAL, LOST, Decision
 from osel_sim.interface.outcome import credited
 from osel_sim.statistics.intervals import wilson_interval
+
+SUMMARY = "summary.json"
 
 
 def summarise(decisions: Sequence[Decision], policies: Sequence[str], selector: str) -> dict[str, Any]:
@@ -21,6 +26,18 @@ def summarise(decisions: Sequence[Decision], policies: Sequence[str], selector: 
         **_part(decisions),
         "policies": {policy: _part([decision for decision in decisions if decision.policy == policy]) for policy in policies},
     }
+
+
+def check_summary(folder: Path, decisions: int) -> None:
+    """Refuse a journal with fewer decisions than the summary beside it was made of.
+
+    Raises:
+        DataError: naming both.
+    """
+    file = folder / SUMMARY
+    summed = read_json(file).get("decisions") if file.exists() else None
+    if isinstance(summed, int) and summed > decisions:
+        raise DataError(f"{file} is of {summed} decisions, {JOURNAL} beside it has {decisions}: {LOST}")
 
 
 def _part(decisions: Sequence[Decision]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """A task: scene, language, goal, subgoals and the expert's plan of one task family, as code wants them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from osel_sim.formats.catalogue import Catalogue, Entity, load_catalogue
@@ -25,6 +25,7 @@ class TaskSpec:
         roles: role that an instruction names -> kind of thing that fills it, or `attribute`.
         unnamed: role that no instruction names -> kind.
         sorted_roles: roles filled by a rule.
+        fixed: role -> the thing or property that always fills it; the others are drawn.
         attributes: property -> what people call the things that have it.
         train, held_out: phrasings with `{role}` fields.
         goal: predicates that must all hold.
@@ -56,6 +57,7 @@ class TaskSpec:
     file: Path
     axes: tuple[str, ...] = AXES
     robot: str = DEFAULT_ROBOT
+    fixed: Mapping[str, str] = field(default_factory=dict)
 
     def entity(self, name: str) -> Entity:
         """The thing of that name."""
@@ -106,4 +108,5 @@ def _spec(task: TaskFile, file: Path, catalogue: Catalogue) -> TaskSpec:
         file=file,
         axes=task.scene.axes,
         robot=task.robot,
+        fixed=task.fixed,
     )

@@ -205,6 +205,8 @@ class TaskFile:
     """Role that no instruction names -> kind of thing that fills it, or the rule by which another role's thing does."""
     scene: SceneTable
     """What stands and lies where."""
+    fixed: dict[str, str] = field(default_factory=dict)
+    """Role -> the thing of the scene that always fills it, or for an attribute the property; everything else is drawn as ever."""
     language: LanguageTable
     """What people say."""
     goal: GoalTable
@@ -230,6 +232,16 @@ class TaskFile:
         if faults := list(scene.faults(roles, unnamed, info.context["catalogue"])):
             refuse(*faults)
         return scene
+
+    @field_validator("fixed")
+    @classmethod
+    def _fits_the_roles(cls, fixed: dict[str, str], info: ValidationInfo) -> dict[str, str]:
+        roles, unnamed, scene = (info.data.get(key) for key in ("roles", "unnamed", "scene"))
+        if info.context is None or roles is None or unnamed is None or scene is None:
+            return fixed
+        if faults := list(_fixed_faults(fixed, roles, unnamed, scene, info.context["catalogue"])):
+            refuse(*faults)
+        return fixed
 
     @field_validator("language")
     @classmethod
@@ -261,6 +273,24 @@ def _unnamed_faults(unnamed: Mapping[str, str | Sorting], roles: Mapping[str, st
         for key, known in (("thing", before), ("attribute", attributes), ("then", things), ("otherwise", things)):
             if (name := getattr(value, key)) not in known:
                 yield (role, key), unknown_value(name, known)
+
+
+def _fixed_faults(
+    fixed: Mapping[str, str], roles: Mapping[str, str], unnamed: Mapping[str, str | Sorting], scene: SceneTable, catalogue: Catalogue
+) -> Faults:
+    """Roles that there are not or that a rule fills, things that are not in the scene or of another kind, and one thing for two roles."""
+    kinds = {**roles, **{role: kind for role, kind in unnamed.items() if not isinstance(kind, Sorting)}}
+    filled: dict[str, str] = {}
+    for role, name in fixed.items():
+        if role not in kinds:
+            yield (role,), "is filled by a rule" if role in unnamed else f"is no role; roles: {', '.join(kinds)}"
+            continue
+        known = list(catalogue.attributes) if kinds[role] == ATTRIBUTE else list(scene.names(kinds[role]))
+        if name not in known:
+            yield (role,), unknown_value(name, known)
+        elif name in filled:
+            yield (role,), f"{name!r} fills the role {filled[name]!r} already"
+        filled[name] = role
 
 
 def _kinds(roles: Mapping[str, str], unnamed: Mapping[str, str | Sorting]) -> dict[str, str]:

@@ -8,24 +8,25 @@ frame on. A remote policy pays for its call as in an episode: delays of the netw
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.core.errors import DataError, UsageError, did_you_mean
+from osel_sim.core.errors import UsageError, did_you_mean
 from osel_sim.core.files import content_digest, file_digest
 from osel_sim.episodes.loop import Driver, episode_seed
+from osel_sim.formats.dataset_mapping import IMAGES, STATE, DatasetMapping
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
+from osel_sim.ingestion.lerobot_check import open_dataset
+from osel_sim.ingestion.lerobot_numbers import actions, check_mapping, states
 from osel_sim.ingestion.write import IngestedInstance
 from osel_sim.interface.encoder import Image
 from osel_sim.interface.policy import Observation
-from osel_sim.sim.specification import ACTION_DIM, STATE_DIM, specification
-
-IMAGES = "observation.images."
-STATE, ACTION = "observation.state", "action"
+from osel_sim.sim.specification import specification
 
 
 @dataclass(frozen=True)
@@ -35,74 +36,54 @@ class Measurement:
     Attributes:
         frames: of each episode, evenly spread from its first on.
         tolerance: success is an error of so much or less.
-        cameras: camera of the policy files -> column of the dataset, where it is not `observation.images.<camera>`.
+        cameras: camera of the policy files -> column of the dataset, where it is not the mapping's.
+        mapping: the datasets' own names and conventions.
+        file: where it was read, for errors.
     """
 
     frames: int = 4
     tolerance: float = 0.05
     cameras: Mapping[str, str] = field(default_factory=dict)
+    mapping: DatasetMapping = field(default_factory=DatasetMapping)
+    file: Path | None = None
 
     def column(self, camera: str) -> str:
         """The dataset's column of a camera."""
-        return self.cameras.get(camera, IMAGES + camera)
+        return self.cameras.get(camera, self.mapping.camera(camera))
 
 
 class Dataset:
     """A LeRobotDataset, checked against what the policies want to see.
 
     Raises:
-        DataError: it is none, or lacks a camera, the state or the actions of the suite's form.
+        DataError: it is none, or lacks a camera, the state or the actions of the suite's form; names file, frame and column.
     """
 
     def __init__(self, folder: Path, cameras: Sequence[str], settings: Measurement) -> None:
         self.folder, self._settings, self._cameras = folder, settings, cameras
-        info = folder / "meta" / "info.json"
-        if not info.is_file():
-            raise DataError(f"{folder}: is no LeRobotDataset, it has no meta/info.json")
-        try:
-            from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-            self._data: Any = LeRobotDataset(f"local/{folder.name}", root=folder)
-        except Exception as error:  # datasets, pyarrow, json and the hub client all have their own
-            raise DataError(f"{folder}: cannot be read as a LeRobotDataset ({type(error).__name__}: {' '.join(str(error).split())[:200]})") from None
-        features: dict[str, Any] = self._data.meta.features
-        for name, length in ((STATE, STATE_DIM), (ACTION, ACTION_DIM)):
-            shape = tuple(features[name]["shape"]) if name in features else None
-            if shape != (length,):
-                raise DataError(f"{folder}: {name!r} must have the shape ({length},) that the policies know, got {shape or 'no such column'}")
-        pictures = [name for name, feature in features.items() if feature["dtype"] in ("image", "video")]
+        self._files = open_dataset(folder)
         for camera in cameras:
-            column = settings.column(camera)
-            if column not in pictures:
-                raise DataError(
-                    f"{folder}: there are no images {column!r} for the policies' camera {camera!r}: {did_you_mean(column, pictures)}"
-                    f"name one of {', '.join(pictures) or 'none'} with --camera {camera}=COLUMN"
-                )
-        self.actions: NDArray[np.float32] = np.asarray(self._data.hf_dataset.with_format("numpy")[ACTION][:], np.float32)
-        self._task = np.asarray(self._data.hf_dataset.with_format("numpy")["task_index"][:], np.int64)
-        self._tasks = {int(index): str(task) for task, index in self._data.meta.tasks["task_index"].items()}
-        if not np.isfinite(self.actions).all():
-            row = int(np.flatnonzero(~np.isfinite(self.actions).all(axis=1))[0])
-            raise DataError(f"{folder}: frame {row}: {ACTION!r} must be finite numbers, got {self.actions[row].tolist()}")
+            self._files.check_images(camera, settings.column(camera), f"--camera {camera}=COLUMN")
+        self._states = states(self._files, settings.mapping)
+        self.actions = actions(self._files, settings.mapping)
 
     def episodes(self) -> list[tuple[int, int]]:
         """First frame of each episode, and the one after its last."""
-        return [(int(row["dataset_from_index"]), int(row["dataset_to_index"])) for row in self._data.meta.episodes]
+        return list(pairwise(self._files.starts.tolist()))
 
     def instruction(self, frame: int) -> str:
         """The task of a frame, in words."""
-        return self._tasks[int(self._task[frame])]
+        return self._files.tasks[int(self._files.task[frame])]
 
     def observation(self, frame: int) -> Observation:
         """What the policies see of a frame."""
-        item = self._data[frame]
-        result: Observation = {IMAGES + camera: _image(item[self._settings.column(camera)]) for camera in self._cameras}
-        return {**result, STATE: np.asarray(item[STATE], np.float32), "task": str(item["task"])}
+        pictures = zip(self._cameras, self.images(frame), strict=True)
+        result: Observation = {IMAGES + camera: image for camera, image in pictures}
+        return {**result, STATE: self._states[frame], "task": self.instruction(frame)}
 
     def images(self, frame: int) -> list[Image]:
         """The images of a frame."""
-        item = self._data[frame]
-        return [_image(item[self._settings.column(camera)]) for camera in self._cameras]
+        return [self._files.image(self._settings.column(camera), frame) for camera in self._cameras]
 
 
 @dataclass(frozen=True)
@@ -120,13 +101,15 @@ class Sample:
 
 
 def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings: Measurement) -> list[Sample]:
-    """The frames that policies are to be measured on: `settings.frames` of each episode of each dataset.
+    """The frames that policies are to be measured on: `settings.frames` of each episode of each dataset, whose images can all be read.
 
     Raises:
         DataError: a dataset is not as the policies want it.
+        ContentError: the mapping does not fit.
         UsageError: two datasets have the same name.
     """
     cameras = sorted({camera for spec in specs for camera in spec.cameras})
+    check_mapping(settings.mapping, settings.file, tuple(cameras))
     for camera in settings.cameras:
         if camera not in cameras:
             raise UsageError(f"--camera {camera}: no policy has that camera: {did_you_mean(camera, cameras)}cameras: {', '.join(cameras)}")
@@ -140,6 +123,7 @@ def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings
         for episode, (start, end) in enumerate(dataset.episodes()):
             chosen = np.unique(np.linspace(start, end, settings.frames, endpoint=False).astype(int))
             for frame in map(int, chosen):
+                dataset.images(frame)  # a broken one is found before the policies are asked, not after
                 key = f"{name}/{episode:06d}/{frame - start:06d}"
                 instance = IngestedInstance(key, dataset.instruction(frame), digest, partial(dataset.images, frame))
                 samples.append(Sample(instance, dataset, frame, end))
@@ -226,12 +210,6 @@ def measure_one(sample: Sample, driver: Driver, observation: Observation, tolera
         error=error,
         score=score,
     )
-
-
-def _image(value: Any) -> Image:
-    """LeRobot's float (3, H, W) in [0, 1] as uint8 (H, W, 3)."""
-    pixels = np.asarray(value, np.float32).transpose(1, 2, 0)
-    return np.ascontiguousarray((pixels * 255).round().clip(0, 255).astype(np.uint8))
 
 
 def _resized(image: Image, side: int) -> Image:

@@ -4,7 +4,7 @@
     name = "mmlu"
 
     [table]
-    files = ["responses/mmlu_{subject}.csv"]     # {subject} becomes a column; csv, tsv, jsonl or parquet
+    files = ["responses/mmlu_{subject}.csv"]     # {subject} becomes a column; csv, tsv, jsonl, json or parquet, or a folder of such
 
     [[join]]                                     # other tables, each with one row for every value of `on`
     files = ["questions.jsonl"]
@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Discriminator, Tag
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
 from osel_sim.formats.toml_types import TABLE, OneOf, Texts, between
@@ -41,12 +41,19 @@ COUNTS = ("value", "characters", "words")
 
 NUMBERS = ("score", "subgoals", "steps", "upload", "inference", "download", "motion", "price")
 """What may be given for each policy besides success, by the log's names."""
+UNITS = {"cents": 1.0, "usd": 100.0}
+"""What a price may be given in, and how many cents that is."""
 VALUES = ("success", "score", "subgoals", "steps", "seconds", "upload", "inference", "download", "motion", "price", "error")
 """Keys of each policy, each of them a flag as well."""
 LABELS = ("split", "phrasing", "target", "container")
 COMMAND_LINE = "command line"
 """What stands in place of the file where the columns' meaning is made of flags."""
-_FLAGS = {"instance.images": "--image", "outcome.policy": "--policy-column", "outcome.repeat": "--repeat-column"}
+_FLAGS = {
+    "instance.images": "--image",
+    "outcome.policy": "--policy-column",
+    "outcome.repeat": "--repeat-column",
+    "outcome.price_unit": "--price-unit",
+}
 """Flags that are not called what their key is called."""
 FIELD = re.compile(r"\{([^{}]+)\}")
 """A column's name in a template."""
@@ -64,6 +71,24 @@ Files = Annotated[Texts, AfterValidator(_one_or_more)]
 Factor = Annotated[float, between(-1e12, 1e12)]
 
 
+def _column_or_number(value: object) -> str | None:
+    if isinstance(value, str):
+        return "column"
+    return "number" if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def _not_zero(number: float) -> float:
+    if number == 0.0:
+        raise ValueError("must not be 0")
+    return number
+
+
+Divisor = Annotated[
+    Annotated[str, Tag("column")] | Annotated[Factor, AfterValidator(_not_zero), Tag("number")],
+    Discriminator(_column_or_number, "wanted", "a column, or a number"),
+]
+
+
 @pydantic_dataclass(frozen=True, config=TABLE)
 class Term:
     """A number for every row: scale * (column, or its length) / divide + offset."""
@@ -74,8 +99,8 @@ class Term:
     """The column's value, or how many characters or words it has (for a price by tokens where only the text is there)."""
     scale: Factor = 1.0
     """What the value is multiplied by."""
-    divide: str | None = None
-    """A column to divide by, such as the number of subgoals there are."""
+    divide: Divisor | None = None
+    """What to divide by: a column, such as the number of subgoals there are, or a number, such as 1000 for milliseconds."""
     offset: Factor = 0.0
     """What is added."""
 
@@ -104,6 +129,7 @@ class PolicyColumns:
         name: in the log.
         numbers: name in the log -> the terms whose sum it is: columns, and numbers that hold for every row.
         error: column that says why there is no valid outcome; empty where there is one.
+        unit: what prices are given in, one of `UNITS`; None: not told, cents unless a column has dollar signs.
         total: `inference` is given as `seconds`, the total.
     """
 
@@ -112,16 +138,17 @@ class PolicyColumns:
     numbers: dict[str, tuple[Term | float, ...]]
     error: str | None = None
     total: bool = False
+    unit: str | None = None
 
     @property
     def needed(self) -> dict[str, str]:
         """All columns it needs -> the key that asks for them."""
-        needed: list[tuple[str | None, str]] = [(self.success.column, "success"), (self.success.divide, "success"), (self.error, "error")]
+        needed: list[tuple[str | float | None, str]] = [(self.success.column, "success"), (self.success.divide, "success"), (self.error, "error")]
         for name, terms in self.numbers.items():
             needed += [(column, self.called(name)) for term in terms if isinstance(term, Term) for column in (term.column, term.divide)]
         columns: dict[str, str] = {}
         for column, name in needed:
-            if column is not None:
+            if isinstance(column, str):
                 columns.setdefault(column, name)
         return columns
 
@@ -150,12 +177,13 @@ class Columns:
         name: of the workload; the task of instances without a group.
         text: template of the instruction or question: columns in braces.
         images: columns with paths of images, relative to the table that names them.
-        group: column whose value is the log's task, or None.
-        key: column that identifies an instance, or None: its text, images and group do.
+        group: template of the log's task, or None.
+        key: template of what identifies an instance, or None: its text, images and group do.
         labels: log column (`split`, `phrasing`, `target`, `container`) -> the table's column.
         duplicates: what to do with a second row of the same instance (and policy, and repeat).
         policy: column of policies in a long table; None where the table is wide.
         repeat: column that numbers repeats from 0 on, or None.
+        propensity: column of the probability with which whoever chose the row's policy chose it, or None.
         policies: the table's name of a policy -> its columns. Empty in a long table whose policies are all alike and not named.
         default: columns of policies that are not named; None where all are.
     """
@@ -173,6 +201,7 @@ class Columns:
     duplicates: str
     policy: str | None
     repeat: str | None
+    propensity: str | None = None
     policies: dict[str, PolicyColumns] = field(default_factory=dict)
     default: PolicyColumns | None = None
 
@@ -187,11 +216,12 @@ class Columns:
         needed = {name: "instance.text" for name in FIELD.findall(self.text)}
         needed |= {name: "instance.images" for name in self.images}
         needed |= {column: f"instance.{label}" for label, column in self.labels.items()}
+        needed |= {name: "instance.key" for name in FIELD.findall(self.key or "")}
+        needed |= {name: "instance.group" for name in FIELD.findall(self.group or "")}
         for key, column in (
-            ("instance.group", self.group),
-            ("instance.key", self.key),
             ("outcome.policy", self.policy),
             ("outcome.repeat", self.repeat),
+            ("outcome.propensity", self.propensity),
         ):
             if column is not None:
                 needed[column] = key
@@ -204,7 +234,7 @@ class Columns:
 
 def flag(key: str) -> str:
     """The flag that stands for a key: `--text` for `instance.text`, `--price of policy 'large'` for `policies.large.price`."""
-    section, _, rest = key.partition(".")
+    section, _, rest = key.removesuffix(".scale").removesuffix(".divide").partition(".")
     policy, _, value = rest.rpartition(".")
     if value == "at_least":
         return "--at-least"

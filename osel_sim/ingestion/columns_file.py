@@ -50,24 +50,26 @@ def parse_columns(data: dict[str, Any], file: Path | str, base: Path) -> Columns
         duplicates=instance.duplicates,
         policy=outcome.policy,
         repeat=outcome.repeat,
-        policies={name: _policy(found.values(policy), name, policy.name or name) for name, policy in found.policies.items()},
-        default=None if found.policies else _policy(found.values(PolicyTable()), PLACE, ""),
+        propensity=outcome.propensity,
+        policies={name: _policy(found.values(policy), name, policy.name or name, outcome.price_unit) for name, policy in found.policies.items()},
+        default=None if found.policies else _policy(found.values(PolicyTable()), PLACE, "", outcome.price_unit),
     )
 
 
-def _policy(values: dict[str, Any], name: str, title: str) -> PolicyColumns:
+def _policy(values: dict[str, Any], name: str, title: str, unit: str | None) -> PolicyColumns:
     """Where the outcome of a policy is.
 
     Args:
         name: the table's.
         title: the log's.
+        unit: of prices, where it is told.
     """
     success = Success(values["success"]) if isinstance(values["success"], str) else values["success"]
     numbers = {key: _terms(values[key], name) for key in NUMBERS if key in values}
     if "seconds" in values:
         numbers["inference"] = _terms(values["seconds"], name)
     error = values.get("error")
-    return PolicyColumns(title, _named(success, name), numbers, None if error is None else error.replace(PLACE, name), "seconds" in values)
+    return PolicyColumns(title, _named(success, name), numbers, None if error is None else error.replace(PLACE, name), "seconds" in values, unit)
 
 
 def _terms(value: str | float | Term | tuple[str | float | Term, ...], name: str) -> tuple[Term | float, ...]:
@@ -78,5 +80,5 @@ def _terms(value: str | float | Term | tuple[str | float | Term, ...], name: str
 
 def _named[T: (Term, Success)](value: T, name: str) -> T:
     """The same with a policy's name in its columns' names."""
-    divide = None if value.divide is None else value.divide.replace(PLACE, name)
+    divide = value.divide.replace(PLACE, name) if isinstance(value.divide, str) else value.divide
     return replace(value, column=value.column.replace(PLACE, name), divide=divide)

@@ -14,6 +14,7 @@ from osel_sim.ingestion.columns import (
     FIELD,
     NUMBERS,
     PLACE,
+    UNITS,
     VALUES,
     Factor,
     Files,
@@ -89,10 +90,10 @@ class InstanceTable:
     """The instruction or question: a column, or a template with columns in braces."""
     images: Annotated[Texts, BeforeValidator(lambda value: [value] if isinstance(value, str) else value, json_schema_input_type=str | Texts)] = ()
     """Columns with paths of images, relative to the table that names them."""
-    group: str | None = None
-    """Column whose value is the log's task."""
-    key: str | None = None
-    """Column that identifies an instance; left out: its text, images and group do."""
+    group: Annotated[str, AfterValidator(_template)] | None = None
+    """What the log calls the task: a column, or a template."""
+    key: Annotated[str, AfterValidator(_template)] | None = None
+    """What identifies an instance: a column, or a template such as `{subject}-{number}`; left out: its text, images and group do."""
     split: str | None = None
     """Column of the log's `split`."""
     phrasing: str | None = None
@@ -141,6 +142,10 @@ class OutcomeTable(ValuesTable):
     """Column of policies, in a long table: one with a row for each instance and policy."""
     repeat: str | None = None
     """Column that numbers repeats from 0 on."""
+    propensity: str | None = None
+    """Column of the probability, in (0, 1], with which the row's policy was chosen, in a long table of one row an instance: logged bandit data."""
+    price_unit: Annotated[str, OneOf(tuple(UNITS))] | None = None
+    """What prices are given in, `cents` or `usd`; left out: cents, or dollars where a column has dollar signs."""
 
 
 @dataclass(frozen=True, kw_only=True, config=TABLE)
@@ -186,6 +191,11 @@ class ColumnsFile:
         """Values that lack, or are there twice."""
         if self.outcome.policy is not None and self.instance.duplicates == "keep":
             yield ("instance", "duplicates"), 'must be "refuse", "drop" or "repeats" in a long table, where many rows are about one instance'
+        if self.outcome.propensity is not None:
+            if self.outcome.policy is None:
+                yield ("outcome", "propensity"), "is of the row's policy: name the column of policies too, in a table with a row for each decision"
+            if self.outcome.repeat is not None or self.instance.duplicates != "refuse":
+                yield ("outcome", "propensity"), "says that each row is a decision of its own; repeats and duplicates have no meaning then"
         if not self.policies and self.outcome.policy is None:
             needs = "a wide table needs [policies.NAME] for each policy, a long one outcome.policy, its column of policies"
             yield ("policies", "NAME"), f"is missing: {needs}"

@@ -6,12 +6,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from osel_sim.core.errors import DataError, UnknownNameError
+from osel_sim.core.errors import DataError, did_you_mean
 from osel_sim.formats.rollout_log import Row
-from osel_sim.ingestion.columns import Columns, PolicyColumns, Success, Term, fill, threshold
-from osel_sim.ingestion.readers import Record, number, text
+from osel_sim.formats.toml_types import quoted
+from osel_sim.ingestion.columns import NUMBERS, UNITS, Columns, PolicyColumns, Success, Term, fill, threshold
+from osel_sim.ingestion.records import Record, listed, number, price, text
+from osel_sim.ingestion.units import with_unit
 
-_TRUE, _FALSE = ("true", "1", "1.0"), ("false", "0", "0.0")
+_TRUE, _FALSE = ("true", "yes", "y", "t", "1", "1.0"), ("false", "no", "n", "f", "0", "0.0")
+_LONGEST = 2**53
+"""Integers beyond this are not exact in the numbers that tables hold, nor are they steps or repeats of anything."""
 _WAITING = ("upload", "inference", "download")
 _COUNTS: dict[str, Callable[[str], int]] = {"characters": len, "words": lambda value: len(value.split())}
 
@@ -41,7 +45,8 @@ class Converted:
         sources: an entry for each instance, in the order of the table.
         policies: names in the log, in the order in which they are named, or of their appearance.
         dropped: rows that were left out as duplicates.
-        differing: those of them that say something else than the row that was kept.
+        differing: those of them whose outcome is another than that of the row that was kept.
+        propensities: of each row, with which probability its policy was chosen; None where the table does not say.
     """
 
     rows: list[Row]
@@ -49,6 +54,7 @@ class Converted:
     policies: list[str]
     dropped: int
     differing: int
+    propensities: list[float] | None
 
 
 def convert(columns: Columns, records: Sequence[Record]) -> Converted:
@@ -59,10 +65,12 @@ def convert(columns: Columns, records: Sequence[Record]) -> Converted:
     Raises:
         DataError: a cell, row or policy that is not as `columns` says; names file, row and column.
     """
+    columns = with_unit(columns, records)
     sources: dict[str, Source] = {}
     outcomes: dict[tuple[str, str, int], tuple[Row, Record]] = {}
     keys: dict[tuple[Any, ...], str] = {}
     counters: dict[str, int] = {}
+    propensities: dict[tuple[str, str, int], float] = {}
     names = {policy.name: None for policy in columns.policies.values()}
     dropped = differing = 0
     for record in records:
@@ -70,11 +78,11 @@ def convert(columns: Columns, records: Sequence[Record]) -> Converted:
         if columns.policy is None:
             if known and columns.repeat is None and columns.duplicates in ("refuse", "drop"):
                 if columns.duplicates == "refuse":
-                    raise _duplicate(columns, record, sources[source.key].record, f"instance {source.key!r}")
+                    raise _duplicate(columns, record, sources[source.key].record, f"instance {quoted(source.key)}")
                 dropped += 1
                 kept = [outcomes.get((source.key, policy.name, 0)) for policy in columns.policies.values()]
                 again = [_row(columns, record, source, policy, 0) for policy in columns.policies.values()]
-                differing += again != [pair and pair[0] for pair in kept]
+                differing += [row and _outcome(row) for row in again] != [pair and _outcome(pair[0]) for pair in kept]
                 continue
             policies = list(columns.policies.values())
         else:
@@ -92,44 +100,56 @@ def convert(columns: Columns, records: Sequence[Record]) -> Converted:
                 row = Row(**{**vars(row), "repeat": place[2]})
             if place in outcomes:
                 if columns.duplicates != "drop":
-                    raise _duplicate(columns, record, outcomes[place][1], f"instance {source.key!r}, policy {policy.name!r}, repeat {row.repeat}")
+                    what = f"instance {quoted(source.key)}, policy {quoted(policy.name)}, repeat {row.repeat}"
+                    raise _duplicate(columns, record, outcomes[place][1], what)
                 dropped += 1
-                differing += row != outcomes[place][0]
+                differing += _outcome(row) != _outcome(outcomes[place][0])
                 continue
             outcomes[place] = row, record
+            if columns.propensity is not None:
+                propensities[place] = _propensity(record, columns.propensity)
     ran = {policy for _, policy, _ in outcomes}
     for name in names:
         if name not in ran:
-            raise DataError(f"{records[0].file}: policy {name!r} has no outcome in any row")
+            raise DataError(f"{records[0].file}: policy {quoted(name)} has no outcome in any row")
     order = {key: index for index, key in enumerate(sources)}, {name: index for index, name in enumerate(names)}
     places = sorted(outcomes, key=lambda place: (order[0][place[0]], order[1][place[1]], place[2]))
     with_outcome = {place[0] for place in places}
     used = [source for key, source in sources.items() if key in with_outcome]
-    return Converted([outcomes[place][0] for place in places], used, list(names), dropped, differing)
+    chances = None if columns.propensity is None else [propensities[place] for place in places]
+    return Converted([outcomes[place][0] for place in places], used, list(names), dropped, differing, chances)
 
 
 def _source(
     columns: Columns, record: Record, sources: dict[str, Source], keys: dict[tuple[Any, ...], str], counters: dict[str, int]
 ) -> tuple[Source, bool]:
     """The instance of a row, and whether an earlier row had it."""
-    task = text(record, columns.group) if columns.group else columns.name
+    task = fill(columns.group, lambda column: text(record, column)) if columns.group else columns.name
     words = fill(columns.text, lambda column: text(record, column))
-    images = tuple(record.file.parent / text(record, column) for column in columns.images)
-    identity = (task, text(record, columns.key)) if columns.key else (task, words, images)
+    images = tuple(_image(record, column) for column in columns.images)
+    identity = (task, fill(columns.key, lambda column: text(record, column))) if columns.key else (task, words, images)
     known = identity in keys
-    if known and not (columns.duplicates == "keep" and columns.policy is None):
+    each_is_one = columns.propensity is not None or (columns.duplicates == "keep" and columns.policy is None)
+    if known and not each_is_one:
         first = sources[keys[identity]]
         if (first.text, first.images) != (words, images):
-            raise DataError(
-                f"{record.where}: instance {first.key!r} has another text or image here than in row {first.record.number} of {first.record.file}"
-            )
+            other = f"row {first.record.number} of {first.record.file}"
+            raise DataError(f"{record.where}: instance {quoted(first.key)} has another text or image here than in {other}")
         return first, True
     if known and columns.key:
-        raise _duplicate(columns, record, sources[keys[identity]].record, f"instance {keys[identity]!r}")
+        raise _duplicate(columns, record, sources[keys[identity]].record, f"instance {quoted(keys[identity])}")
     counters[task] = counters.get(task, 0) + 1
     key = f"{task}/{identity[1] if columns.key else format(counters[task], '06d')}"
     keys[identity] = key
     return Source(key, task, words, images, record), False
+
+
+def _image(record: Record, column: str) -> Path:
+    """The file of an image; a path is relative to the table that names it."""
+    value = record.values[column]
+    if value is not None and not isinstance(value, str):
+        raise record.error(column, f"must be the path of an image file, got {quoted(value)}; write images into files and name these")
+    return record.file.parent / text(record, column)
 
 
 def _policy(columns: Columns, record: Record, names: Collection[str]) -> PolicyColumns:
@@ -140,11 +160,14 @@ def _policy(columns: Columns, record: Record, names: Collection[str]) -> PolicyC
         return columns.policies[name]
     if columns.default is None:
         where = "--policies" if columns.from_flags else str(columns.file)
-        raise record.error(column, str(UnknownNameError("policy", name, columns.policies, where)))
+        near = did_you_mean(name[:200], columns.policies)
+        raise record.error(column, f"unknown policy {quoted(name)}: {near}known: {listed(sorted(columns.policies))} ({where})")
     alike = None if name in names else next((other for other in names if _plain(other) == _plain(name)), None)
     if alike is not None:
         way = "after --policies" if columns.from_flags else "as [policies.NAME]"
-        raise record.error(column, f"policy {name!r} and {alike!r} differ only in capitals or spaces; write both alike, or name all policies {way}")
+        raise record.error(
+            column, f"policy {quoted(name)} and {quoted(alike)} differ only in capitals or spaces; write both alike, or name all policies {way}"
+        )
     return replace(columns.default, name=name)
 
 
@@ -156,9 +179,17 @@ def _repeat(columns: Columns, record: Record) -> int | None:
     if columns.repeat is None:
         return None
     value = number(record, columns.repeat)
-    if value is None or value < 0 or value != int(value):
-        raise record.error(columns.repeat, f"must be an integer of 0 or more, got {record.values[columns.repeat]!r}")
+    if value is None or not 0 <= value <= _LONGEST or value != int(value):
+        raise record.error(columns.repeat, f"must be an integer in [0, 2^53], got {quoted(record.values[columns.repeat])}")
     return int(value)
+
+
+def _propensity(record: Record, column: str) -> float:
+    value = number(record, column)
+    if value is None or not 0.0 < value <= 1.0:
+        shown = "nothing" if value is None else quoted(record.values[column])
+        raise record.error(column, f"must be the probability, in (0, 1], with which the row's policy was chosen, got {shown}")
+    return value
 
 
 def _row(columns: Columns, record: Record, source: Source, policy: PolicyColumns, repeat: int) -> Row | None:
@@ -214,8 +245,8 @@ def _success(columns: Columns, record: Record, success: Success) -> bool | None:
     if success.true:
         if value in success.true or value in success.false:
             return value in success.true
-        raise record.error(success.column, f"must be one of {', '.join([*success.true, *success.false])}, got {value!r}")
-    word = str(value).strip().lower()
+        raise record.error(success.column, f"must be one of {listed([*success.true, *success.false])}, got {quoted(value)}")
+    word = _word(value)
     if word in _TRUE or word in _FALSE:
         return word in _TRUE
     if word == "nan":
@@ -224,27 +255,37 @@ def _success(columns: Columns, record: Record, success: Success) -> bool | None:
         hint = f"a graded outcome is a score, and its success a threshold: {threshold(columns.from_flags)}"
     else:
         hint = "a mapping file (--map) says which words mean it: success = { column = ..., true = [WORDS], false = [WORDS] }"
-    raise record.error(success.column, f"must be true or false (or 1 or 0), got {value!r}; {hint}; leave it empty where the policy did not run")
+    raise record.error(success.column, f"must be true or false (or 1 or 0), got {quoted(value)}; {hint}; leave it empty where the policy did not run")
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, str):
+        return value.strip().lower()
+    return str(value).lower() if isinstance(value, bool) else str(float(value)) if _is_number(value) else quoted(value)
 
 
 def _number(record: Record, policy: PolicyColumns, name: str, terms: Sequence[Term | float]) -> float:
-    total = math.fsum(_term(record, term) for term in terms)
+    total = math.fsum(_term(record, term, price if name == "price" else number) for term in terms)
+    if name == "price":
+        total *= UNITS[policy.unit or "cents"]
     called = policy.called(name)
     column = next((term.column for term in terms if isinstance(term, Term)), None)
 
     def error(problem: str) -> DataError:
         problem = f"{called} must {problem}, got {total:g}"
-        return DataError(f"{record.where}, policy {policy.name!r}: {problem}") if column is None else record.error(column, problem)
+        return DataError(f"{record.where}, policy {quoted(policy.name)}: {problem}") if column is None else record.error(column, problem)
 
     low, high = (-math.inf, math.inf) if name == "score" else (0.0, 1.0) if name == "subgoals" else (0.0, math.inf)
     if not low <= total <= high:
         raise error(f"lie in [{low:g}, {high:g}]")
-    if name == "steps" and total != int(total):
-        raise error("be an integer")
+    if not math.isfinite(total):
+        raise error("be a finite number")
+    if name == "steps" and (total != int(total) or total > _LONGEST):
+        raise error("be an integer" if total <= _LONGEST else "lie in [0, 2^53]")
     return total
 
 
-def _term(record: Record, term: Term | float) -> float:
+def _term(record: Record, term: Term | float, read: "Callable[[Record, str], float | None]") -> float:
     if not isinstance(term, Term):
         return term
     if term.count in _COUNTS:
@@ -252,22 +293,30 @@ def _term(record: Record, term: Term | float) -> float:
         if term.divide is not None:
             value = _divided(record, float(value or 0), term.divide)
     else:
-        value = _ratio(record, term.column, term.divide)
+        value = _ratio(record, term.column, term.divide, read)
     if value is None:
         raise record.error(term.column, "is empty although the policy has an outcome")
     return term.scale * value + term.offset
 
 
-def _ratio(record: Record, column: str, divide: str | None) -> float | None:
-    value = number(record, column)
+def _ratio(record: Record, column: str, divide: str | float | None, read: "Callable[[Record, str], float | None]" = number) -> float | None:
+    value = read(record, column)
     return value if value is None or divide is None else _divided(record, value, divide)
 
 
-def _divided(record: Record, value: float, divide: str) -> float:
-    by = number(record, divide)
+def _divided(record: Record, value: float, divide: str | float) -> float:
+    by = number(record, divide) if isinstance(divide, str) else divide
     if not by:
-        raise record.error(divide, f"must be a number other than 0 to divide by, got {record.values[divide]!r}")
-    return value / by
+        raise record.error(str(divide), f"must be a number other than 0 to divide by, got {quoted(record.values[str(divide)])}")
+    try:
+        return value / by
+    except OverflowError:
+        return math.inf
+
+
+def _outcome(row: Row) -> tuple[Any, ...]:
+    """What two rows of the same policy on the same instance may differ in; labels are none of it."""
+    return tuple(getattr(row, name) for name in ("success", *NUMBERS, "error"))
 
 
 def _duplicate(columns: Columns, record: Record, first: Record, what: str) -> DataError:
@@ -281,5 +330,5 @@ def _duplicate(columns: Columns, record: Record, first: Record, what: str) -> Da
 def _is_number(value: Any) -> bool:
     try:
         return math.isfinite(float(value))
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, ArithmeticError):
         return False

@@ -1,4 +1,4 @@
-"""Reading CSV, TSV, JSON lines and Parquet as rows that know where they came from; every complaint names file and row.
+"""Reading tables as rows that know where they came from: only the columns that are named are read, and every complaint names file and row.
 
 Parquet is read by pyarrow, text by the standard library's csv and json. pandas 2.3 (either of its CSV engines) and pyarrow's CSV reader were tried
 on the tables that the tests refuse, and accept some of them as something else: pandas fills up a row that was cut with NaN, takes a first row that
@@ -7,48 +7,38 @@ as text. pandas' JSON reader keeps the last of two equal keys and makes integers
 begins. A wrong outcome that looks right is worse than a slow reader.
 """
 
-import csv
-import json
-import math
-import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from osel_sim.core.arrays import check_rows, local
 from osel_sim.core.errors import DataError, did_you_mean
-from osel_sim.ingestion.columns import Columns, Join, flag
-
-_CAPTURE = re.compile(r"\\\{([A-Za-z_][A-Za-z0-9_]*)\\\}")
-_LONGEST_FIELD = 64 * 1024 * 1024
-DELIMITERS = {".csv": ",", ".tsv": "\t"}
-SUFFIXES = (*DELIMITERS, ".jsonl", ".ndjson", ".parquet")
+from osel_sim.core.parquet import PARQUET_ERRORS, parquet_columns, parquet_rows, read_parquet
+from osel_sim.formats.toml_types import quoted
+from osel_sim.ingestion.columns import Columns, flag
+from osel_sim.ingestion.records import Record, cell, form, listed, text
+from osel_sim.ingestion.table_files import DELIMITERS, PARQUET, find_files
+from osel_sim.ingestion.text_tables import other_delimiter, read_delimited, read_json_rows
 
 
 @dataclass(frozen=True)
-class Record:
-    """One row of a table.
+class Table:
+    """The rows of all files of a table.
 
     Attributes:
-        number: from 1 on, the header not counted.
-        line: where it begins in a text file; None in Parquet.
-        values: column -> text, number, bool or None. An empty cell is None.
+        columns: of its first file, those that are not wanted included.
+        there: the wanted ones that it has.
+        records: at least one.
     """
 
-    file: Path
-    number: int
-    line: int | None
-    values: dict[str, Any]
+    columns: Sequence[str]
+    there: Collection[str]
+    records: list[Record]
 
     @property
-    def where(self) -> str:
-        """`file, row 3 (line 12)`."""
-        return f"{self.file}, row {self.number}" + (f" (line {self.line})" if self.line is not None else "")
-
-    def error(self, column: str, problem: str) -> DataError:
-        """An error about one cell, to be raised."""
-        return DataError(f"{self.where}, column {column!r}: {problem}")
+    def file(self) -> Path:
+        """The first one."""
+        return self.records[0].file
 
 
 def read_tables(columns: Columns) -> list[Record]:
@@ -57,259 +47,155 @@ def read_tables(columns: Columns) -> list[Record]:
     Raises:
         DataError: a file is missing, empty, cut, of a wrong form, or lacks a column that is named.
     """
-    records = _read_all(columns.base, columns.files)
+    needed = columns.needed
+    wanted = {*needed, *(join.on for join in columns.joins)}
+    table = _read_all(columns.base, columns.files, wanted)
+    there, records = set(table.there), table.records
     for join in columns.joins:
-        records = _joined(records, _read_all(columns.base, join.files), join)
-    there = records[0].values.keys()
-    for column, key in columns.needed.items():
+        other = _read_all(columns.base, join.files, wanted)
+        for side in (table, other):
+            if join.on not in side.there and (side is other or join.on not in there):
+                raise DataError(f"{side.file}: there is no column {quoted(join.on)} to join on: {_instead(side, join.on)}")
+        clash = (there & set(other.there)) - {join.on}
+        if clash:
+            raise DataError(
+                f"{other.file}: column {quoted(min(clash))} is in {table.file} as well; rename one; only {quoted(join.on)} may be in both"
+            )
+        there |= set(other.there)
+        records = _joined(records, other, join.on)
+    for column, key in needed.items():
         if column not in there:
             who = f"{flag(key)} names" if columns.from_flags else f"{columns.file} names as {key}"
-            raise DataError(f"{records[0].file}: there is no column {column!r}, which {who}: {_instead(records[0], column)}")
+            raise DataError(f"{table.file}: there is no column {quoted(column)}, which {who}: {_instead(table, column)}")
     return records
 
 
-def find_files(base: Path, patterns: Sequence[str]) -> list[tuple[Path, dict[str, str]]]:
-    """Files of the patterns, each once and in order, with what `{name}` stands for in each; `*` and `?` stand for any characters.
+def first_columns(base: Path, patterns: Sequence[str]) -> list[str]:
+    """The columns of a table's first file.
 
     Raises:
-        DataError: a pattern has no file, or a file's format is not known.
+        DataError: there is no such file, or it cannot be read.
     """
-    found: dict[Path, dict[str, str]] = {}
-    for pattern in patterns:
-        matches: list[tuple[Path, dict[str, str]]] = [(base / Path(pattern).anchor, {})]
-        for part in Path(pattern).relative_to(Path(pattern).anchor).parts:
-            matches = [deeper for folder, captured in matches for deeper in _matches(folder, part, captured)]
-        files = [(file, captured) for file, captured in matches if file.is_file()]
-        if not files:
-            raise DataError(f"{base / pattern}: there is no such file")
-        for file, captured in files:
-            if file.suffix.lower() not in SUFFIXES:
-                raise DataError(f"{file}: unknown format {file.suffix!r}, known: {', '.join(SUFFIXES)}")
-            found.setdefault(file, captured)
-    return list(found.items())
+    file, captured = find_files(base, patterns)[0]
+    return [*_read(file, ())[0], *captured]
 
 
-def _matches(folder: Path, part: str, captured: dict[str, str]) -> Iterator[tuple[Path, dict[str, str]]]:
-    """What one part of a pattern stands for in a folder."""
-    if not re.search(r"[*?{]", part):
-        if (folder / part).exists():
-            yield folder / part, captured
-        return
-    name = re.escape(part).replace(r"\*", ".*").replace(r"\?", ".")
-    expression = re.compile(_CAPTURE.sub(r"(?P<\1>.+)", name), re.DOTALL)
-    for item in sorted(folder.glob("*")):
-        match = expression.fullmatch(item.name)
-        if match and all(captured.get(key, value) == value for key, value in match.groupdict().items()):
-            yield item, {**captured, **match.groupdict()}
-
-
-def _read_all(base: Path, patterns: Sequence[str]) -> list[Record]:
+def _read_all(base: Path, patterns: Sequence[str], wanted: Collection[str]) -> Table:
     records: list[Record] = []
-    first: Record | None = None
-    for file, captured in find_files(base, patterns):
-        rows = _read(file)
-        clash = captured.keys() & rows[0].values.keys()
+    parts: list[tuple[Path, list[str], set[str]]] = []
+    files = find_files(base, patterns)
+    for file, captured in files:
+        columns, rows = _read(file, wanted)
+        if not rows:
+            continue  # writers of parts leave empty ones
+        clash = captured.keys() & set(columns)
         if clash:
-            raise DataError(f"{file}: column {min(clash)!r} is in the table and in the pattern of file names; name the pattern's part otherwise")
-        if first is None:
-            first = rows[0]
-        different = first.values.keys() ^ {**rows[0].values, **captured}.keys() if records else set()
-        if different:
-            raise DataError(f"{file}: column {min(different)!r} is only in one of this file and {first.file}; their columns must be the same")
-        records += [Record(row.file, row.number, row.line, {**row.values, **captured}) for row in rows]
-        first = records[0]
-    return records
+            raise DataError(
+                f"{file}: column {quoted(min(clash))} is in the table and in the pattern of file names; name the pattern's part otherwise"
+            )
+        told = {name: cell(value) for name, value in captured.items() if name in wanted}
+        parts.append((file, [*columns, *captured], {*rows[0].values, *told}))
+        records += [Record(row.file, row.number, row.line, {**row.values, **told}) for row in rows]
+    if not records:
+        raise DataError(f"{files[0][0]}: has no rows" + (f", nor have {len(files) - 1} other files" if len(files) > 1 else ""))
+    there = set().union(*(part[2] for part in parts))
+    for file, columns, own in parts:
+        lacking = there - own
+        if lacking and (file.suffix.lower() in DELIMITERS or file.suffix.lower() in PARQUET):
+            first = next(other for other, _, names in parts if min(lacking) in names)
+            raise DataError(f"{file}: column {quoted(min(lacking))} is missing, and is in {first}: columns: {listed(columns)}")
+    for record in records:
+        for name in there - record.values.keys():
+            record.values[name] = None  # a key that is left out of a whole file of JSON
+    return Table(parts[0][1], there, records)
 
 
-def _read(file: Path) -> list[Record]:
-    """The rows of one file, at least one."""
+def _read(file: Path, wanted: Collection[str]) -> tuple[list[str], list[Record]]:
+    """Columns and rows of one file."""
     suffix = file.suffix.lower()
     try:
-        if suffix == ".parquet":
-            rows = list(_parquet(file))
+        if suffix in PARQUET:
+            columns, rows = _parquet(file, wanted)
         elif suffix in DELIMITERS:
-            rows = list(_delimited(file, DELIMITERS[suffix]))
+            columns, rows = read_delimited(file, wanted)
         else:
-            rows = list(_json_lines(file))
+            columns, rows = read_json_rows(file, wanted)
     except UnicodeDecodeError as error:
         raise DataError(f"{file}: is not UTF-8 text ({error.reason} at byte {error.start})") from None
     except OSError as error:
         raise DataError(f"{file}: cannot be read ({error.strerror or error})") from None
-    if not rows:
-        raise DataError(f"{file}: has no rows")
-    return rows
+    return columns, rows
 
 
-def _delimited(file: Path, delimiter: str) -> Iterator[Record]:
-    before = csv.field_size_limit(_LONGEST_FIELD)  # the default refuses texts of more than 128 KiB
-    header, start = None, 1
-    try:
-        with file.open(encoding="utf-8-sig", newline="") as handle:
-            reader = csv.reader(handle, delimiter=delimiter, strict=True)
-            header = next(reader, None)
-            if header is None:
-                raise DataError(f"{file}: is empty, expected a header with the columns' names")
-            for name in header:
-                if not name or header.count(name) > 1:
-                    raise DataError(f"{file}: line 1: " + (f"column {name!r} is there twice" if name else "a column has no name"))
-            start, number = reader.line_num + 1, 0
-            for fields in reader:
-                if fields:  # a blank line is none
-                    number += 1
-                    if len(fields) != len(header):
-                        raise DataError(
-                            f"{file}, row {number} (line {start}): has {len(fields)} fields, the header has {len(header)}; "
-                            "the file was cut, or a quote is missing" + _other_delimiter(file, header)
-                        )
-                    yield Record(file, number, start, {name: text or None for name, text in zip(header, fields, strict=True)})
-                start = reader.line_num + 1
-    except csv.Error as error:
-        raise DataError(
-            f"{file}: the row that begins at line {start} cannot be read ({error}); "
-            f"the file was cut, a quote is wrong, or it is not separated by {delimiter!r}"
-        ) from None
-    finally:
-        csv.field_size_limit(before)
+def _parquet(file: Path, wanted: Collection[str]) -> tuple[list[str], list[Record]]:
+    names = parquet_columns(file, wanted)
+    outer = {name: next((head for head, _ in _splits(name) if head in names), None) for name in wanted}
+    table = read_parquet(file, list(dict.fromkeys(name for name in outer.values() if name is not None)))
+    found: dict[str, list[Any]] = {}
+    for name, head in outer.items():
+        column = None if head is None else _inner(table[head], name[len(head) + 1 :])
+        if column is not None:
+            found[name] = _cells(file, name, column)
+    return names, [Record(file, row + 1, None, {name: cell(values[row]) for name, values in found.items()}) for row in range(parquet_rows(file))]
 
 
-def _json_lines(file: Path) -> Iterator[Record]:
-    rows: list[tuple[int, dict[str, Any]]] = []
-    with file.open(encoding="utf-8-sig") as handle:
-        for line, text in enumerate(handle, start=1):
-            if not text.strip():
-                continue
-            try:
-                value = json.loads(text, object_pairs_hook=_without_repetition)
-            except DataError as error:
-                raise DataError(f"{file}, line {line}: {error}") from None
-            except (ValueError, RecursionError) as error:
-                raise DataError(f"{file}, line {line}: is not JSON ({error}); every line must be one object, the file may have been cut") from None
-            if not isinstance(value, dict):
-                raise DataError(f"{file}, line {line}: must be an object, got {type(value).__name__}")
-            rows.append((line, value))
-    # A key that is left out is an empty cell.
-    columns = list(dict.fromkeys(name for _, row in rows for name in row))
-    for number, (line, row) in enumerate(rows, start=1):
-        yield Record(file, number, line, {name: _cell(row.get(name)) for name in columns})
+def _splits(name: str) -> Iterator[tuple[str, str]]:
+    """A name with nothing behind it, then cut in two at each of its dots, the longest part first."""
+    yield name, ""
+    for at in sorted((index for index, letter in enumerate(name) if letter == "."), reverse=True):
+        yield name[:at], name[at + 1 :]
 
 
-def _without_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    result: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in result:
-            raise DataError(f"key {name!r} is there twice")
-        result[name] = value
-    return result
-
-
-def _parquet(file: Path) -> Iterator[Record]:
+def _inner(column: Any, path: str) -> Any:
+    """A field within a struct, `a.b`; None where there is none of that name."""
     import pyarrow
-    import pyarrow.parquet
+    import pyarrow.compute
 
+    if not path:
+        return column
+    fields = [field.name for field in column.type] if pyarrow.types.is_struct(column.type) else []
+    for head, rest in _splits(path):
+        if head in fields and (found := _inner(pyarrow.compute.struct_field(column, fields.index(head)), rest)) is not None:
+            return found
+    return None
+
+
+def _cells(file: Path, name: str, column: Any) -> list[Any]:
+    """A column's values; where one cannot be had (a date beyond Python's, text that is no UTF-8), its row is named."""
     try:
-        names = pyarrow.parquet.read_schema(local(file)).names
-        check_rows(file)
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise DataError(f"{file}: column {twice!r} is there twice")
-        rows = pyarrow.parquet.read_table(local(file)).to_pylist()
-    except (pyarrow.ArrowException, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        raise DataError(f"{file}: is not a whole Parquet file ({reason})") from None
-    for number, row in enumerate(rows, start=1):
-        yield Record(file, number, None, {name: _cell(value) for name, value in row.items()})
+        values: list[Any] = column.to_pylist()
+    except PARQUET_ERRORS:
+        for row, value in enumerate(column, start=1):
+            try:
+                value.as_py()
+            except PARQUET_ERRORS as error:
+                reason = " ".join(str(error).split())[:200] or type(error).__name__
+                raise DataError(f"{file}, row {row}, column {quoted(name)}: cannot be read ({reason}); its type is {column.type}") from None
+        raise
+    return values
 
 
-def _joined(records: list[Record], others: list[Record], join: Join) -> list[Record]:
-    for side in (records[0], others[0]):
-        if join.on not in side.values:
-            raise DataError(f"{side.file}: there is no column {join.on!r} to join on: {_instead(side, join.on)}")
-    clash = (records[0].values.keys() & others[0].values.keys()) - {join.on}
-    if clash:
-        raise DataError(f"{others[0].file}: column {min(clash)!r} is in {records[0].file} as well; rename one; only {join.on!r} may be in both")
+def _joined(records: list[Record], others: Table, on: str) -> list[Record]:
     by_key: dict[str, Record] = {}
-    for other in others:
-        key = text(other, join.on)
+    for other in others.records:
+        key = text(other, on)
         if key in by_key:
-            raise other.error(join.on, f"{key!r} is in row {by_key[key].number} of {by_key[key].file} already; a joined table has one row for each")
+            raise other.error(on, f"{quoted(key)} is in row {by_key[key].number} of {by_key[key].file} already; a joined table has one row for each")
         by_key[key] = other
     result = []
+    forms: Mapping[str, str] | None = None
     for record in records:
-        match = by_key.get(text(record, join.on))
+        match = by_key.get(text(record, on))
         if match is None:
-            raise record.error(join.on, f"{record.values[join.on]!r} is not in {others[0].file}")
+            forms = forms or {form(key): key for key in by_key}
+            near = forms.get(form(text(record, on)))
+            hint = f"; it has {quoted(near)}, which differs only in form: write both alike" if near is not None else ""
+            raise record.error(on, f"{quoted(record.values[on])} is not in {others.file}{hint}")
         result.append(Record(record.file, record.number, record.line, {**match.values, **record.values}))
     return result
 
 
-def _instead(record: Record, column: str) -> str:
+def _instead(table: Table, column: str) -> str:
     """What may have been meant by a column that is not there."""
-    columns = list(record.values)
-    return f"{did_you_mean(column, columns)}columns: {', '.join(columns)}" + _other_delimiter(record.file, columns, column)
-
-
-def _other_delimiter(file: Path, columns: Sequence[str], missing: str | None = None) -> str:
-    """A hint where a column's name looks like a header with another delimiter, being the only one or having the missing column in it."""
-    own = DELIMITERS.get(file.suffix.lower())
-    for name in columns if own else ():
-        for delimiter in (";", "\t", "|", ","):
-            parts = [part.strip() for part in name.split(delimiter)]
-            if delimiter != own and len(parts) > 1 and (len(columns) == 1 or missing in parts):
-                right = next((suffix for suffix, other in DELIMITERS.items() if other == delimiter), None)
-                way = f"name it {right}" if right else "write it with one of these"
-                return f"; it seems to be separated by {delimiter!r}, but a .csv is by ',' and a .tsv by '\\t': {way}"
-    return ""
-
-
-def _cell(value: Any) -> Any:
-    """A cell as it was read: an empty one is None, and bytes are the text they encode, if they do."""
-    if isinstance(value, bytes):
-        try:
-            value = value.decode()
-        except UnicodeDecodeError:
-            return value
-    return None if value == "" else value
-
-
-def number(record: Record, column: str) -> float | None:
-    """A finite number, or None where the cell is empty.
-
-    Raises:
-        DataError: something else is there.
-    """
-    value = record.values[column]
-    if value is None:
-        return None
-    numeric = isinstance(value, str) or hasattr(value, "__float__")
-    if isinstance(value, bool) or not numeric or (isinstance(value, str) and "_" in value):  # Python takes 1_000 for a number
-        raise record.error(column, f"must be a number, got {value!r}")
-    try:
-        result = float(value)
-    except ValueError:
-        raise record.error(column, f"must be a number, got {value!r}") from None
-    except OverflowError:  # an integer of hundreds of digits
-        raise record.error(column, "must be a finite number, got a far larger one") from None
-    if not math.isfinite(result):
-        raise record.error(column, f"must be a finite number, got {value}; leave it empty where the policy did not run")
-    return result
-
-
-def text(record: Record, column: str) -> str:
-    """A cell as text.
-
-    Raises:
-        DataError: it is empty, or holds a list, an object, or what cannot be written as UTF-8.
-    """
-    value = record.values[column]
-    if value is None:
-        raise record.error(column, "is empty, expected text")
-    if isinstance(value, bytes):
-        raise record.error(column, f"must be text, got {len(value)} bytes that are not UTF-8")
-    if isinstance(value, list | dict) or (isinstance(value, float) and not math.isfinite(value)):
-        raise record.error(column, f"must be text, got {value!r}")
-    result = str(value)
-    try:
-        result.encode()
-    except UnicodeEncodeError as error:
-        raise record.error(column, f"must be text, got {result[error.start]!r} in it, which is only half of a character") from None
-    return result
+    near = did_you_mean(column[:200], [name for name in table.columns if len(name) <= 200])
+    return f"{near}columns: {listed(table.columns)}" + other_delimiter(table.file, table.columns, column)

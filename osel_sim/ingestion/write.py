@@ -6,9 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from osel_sim.core.errors import DataError, UsageError
+from osel_sim.core.errors import UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_json
 from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
 from osel_sim.interface.encoder import Encoder, Image
@@ -91,21 +89,3 @@ def write_log(
     if not there:
         write_rollouts(folder, rows, {**metadata, "encoder": encoder.identity})
     return encoder.identity
-
-
-def load_image(file: Path, where: str) -> Image:
-    """An image file as uint8 (H, W, 3) RGB.
-
-    Args:
-        where: row that names the file.
-
-    Raises:
-        DataError: it is missing or cannot be read.
-    """
-    from PIL import Image as PillowImage
-
-    try:
-        with PillowImage.open(file) as image:
-            return np.asarray(image.convert("RGB"), np.uint8)
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow says SyntaxError for a broken PNG
-        raise DataError(f"{where}: image {file} cannot be read ({' '.join(str(error).split())})") from None

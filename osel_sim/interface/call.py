@@ -17,6 +17,7 @@ class Call:
         megabytes: moved both ways (10^6 bytes); 0 for a local policy.
         measured_seconds: what the call really took here; for `timing.jsonl` only.
         failure: why there are no actions (`deadline`, `outage`, or a sentence), or None.
+        sent: the policy was asked. False where it could not be reached: that costs time, but is no call and has no price.
     """
 
     actions: Actions | None
@@ -26,6 +27,7 @@ class Call:
     megabytes: float = 0.0
     measured_seconds: float = 0.0
     failure: str | None = None
+    sent: bool = True
 
     def __post_init__(self) -> None:
         if (self.actions is None) == (self.failure is None):

@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Protocol
 
+from osel_sim.interface.robot import DEFAULT_ROBOT
+
 SPLITS = ("train", "validation", "test")
 SUITE_SEPARATOR = ":"
 """Between the suite and the task, as in `metaworld:reach-v3`."""
@@ -13,7 +15,7 @@ class Instance(Protocol):
 
     @property
     def key(self) -> str:
-        """Name of the instance, unique over all suites: `task/split/level/seed`."""
+        """Name of the instance, unique over all suites: what `instance_key` makes of its task, split, level, axes, seed and robot."""
         ...
 
     @property
@@ -72,6 +74,16 @@ def label(level: int, axes: str | None) -> str:
     return str(level) if axes is None else axes if level == 0 else f"{level},{axes}"
 
 
+def instance_key(task: str, split: str, perturbed: str, seed: int, robot: str | None = None) -> str:
+    """What fixes an instance, as its name: `pick_place/test/2/7`, or `pick_place/test/2/7-UR5e` for another robot than the usual one.
+
+    Args:
+        perturbed: as `label` gives it.
+        robot: None is the usual one.
+    """
+    return f"{task}/{split}/{perturbed}/{seed}" + ("" if robot in (None, DEFAULT_ROBOT) else f"-{robot}")
+
+
 @dataclass(frozen=True)
 class SeededInstance:
     """An instance of which a suite need say no more than its seed and its instruction. For suites that do: derive from it."""
@@ -90,7 +102,7 @@ class SeededInstance:
     @property
     def key(self) -> str:
         """Name of the instance, unique over all suites."""
-        return f"{self.task}/{self.split}/{label(self.level, self.axes)}/{self.seed}"
+        return instance_key(self.task, self.split, label(self.level, self.axes), self.seed, self.other_robot)
 
     @property
     def simulator_seed(self) -> int:

@@ -29,7 +29,7 @@ class Outcome:
         subgoals: fraction of the task's subgoals reached, in [0, 1].
         steps: control steps, waiting included.
         seconds: upload, inference, download, motion.
-        calls: how often the policy was asked for a chunk of actions.
+        calls: how often the policy was asked for a chunk of actions; one that could not be reached was not asked.
         actions: how many of its actions were executed.
         price: in cents (policy file: per action, per call, per megabyte).
         fallback: why a fallback policy had to take over, or None.

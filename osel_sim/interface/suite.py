@@ -4,7 +4,7 @@ import contextlib
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from osel_sim.core.errors import MissingPackageError, UnknownNameError, UsageError
 from osel_sim.interface.environment import Environment, EnvironmentSpec
@@ -92,6 +92,15 @@ class Suite(Protocol):
 
     def open(self, task: str) -> Environment:
         """Make the environment of a task. Closed by whoever asked for it."""
+        ...
+
+
+@runtime_checkable
+class Prepares(Protocol):
+    """A suite that has something to do once on a machine, such as compiling, which every worker would do for itself otherwise."""
+
+    def prepare(self) -> None:
+        """Do it, unless it is done."""
         ...
 
 

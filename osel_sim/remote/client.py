@@ -15,7 +15,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.core.errors import PolicyError, RemoteError
 from osel_sim.core.proxies import Proxy, proxy_for
-from osel_sim.core.shown import shown
+from osel_sim.core.shown import TOKEN_VARIABLE, shown
 from osel_sim.formats.conventions import Conventions
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Actions, Observation
@@ -35,6 +35,14 @@ class HungUpError(RemoteError):
 
 class NoAnswerError(RemoteError):
     """Nothing came, or went, in time: the server takes long, or something between has dropped the connection without a word."""
+
+
+class UnsentError(RemoteError):
+    """The question never left this machine."""
+
+
+class GoneError(UnsentError, HungUpError):
+    """The connection had ended before the question."""
 
 
 @dataclass(frozen=True)
@@ -145,12 +153,13 @@ class RemoteClient:
         """Actions for one observation.
 
         Raises:
+            UnsentError: the connection was closed before, or the server sent something before it was asked.
             RemoteError: timeout, closed, an error message, or an answer without proper actions.
         """
         start = time.perf_counter()
         environment = self._environment
         if self._connection is None:
-            raise RemoteError(f"{self.url}: not connected")
+            raise UnsentError(f"{self.url}: not connected")
         reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation), environment) if self.foreign else observation)
         measured = time.perf_counter() - start
         try:
@@ -192,7 +201,7 @@ class RemoteClient:
             connection = self._hang_up.enter_context(opening)
         except InvalidStatus as error:
             status = error.response.status_code
-            raise RemoteError(f"{self.url}: " + ("refused the token" if status in (401, 403) else f"answered HTTP {status}")) from None
+            raise RemoteError(f"{self.url}: " + (self._unauthorised() if status in (401, 403) else f"answered HTTP {status}")) from None
         except TimeoutError:
             raise RemoteError(f"{self.url}: no connection{way} within {self._timeout:g} s{advice}") from None
         except OSError as error:
@@ -222,9 +231,15 @@ class RemoteClient:
             )
         return proxy
 
+    def _unauthorised(self) -> str:
+        if self._token:
+            return f"refused the token; the environment variable {TOKEN_VARIABLE} holds the one that is sent"
+        return f"wants a token: put it into the environment variable {TOKEN_VARIABLE}"
+
     def _ask(self, message: Any) -> tuple[Any, int]:
         if self._connection is None:
-            raise RemoteError(f"{self.url}: not connected")
+            raise UnsentError(f"{self.url}: not connected")
+        self._check_silent(self._connection)
         end = time.monotonic() + self._timeout
         frame = pack(message)
         try:
@@ -235,6 +250,18 @@ class RemoteClient:
                 raise self._fail(f"took no message within {self._timeout:g} s", NoAnswerError) from None
             raise self._fail(f"closed the connection ({error})", HungUpError) from None
         return self._decode(self._receive(end), "answer", self.foreign), len(frame)
+
+    def _check_silent(self, connection: ClientConnection) -> None:
+        """Refuse an answer that lies ready before its question: a server that answers twice would shift all answers by one, unnoticed."""
+        try:
+            early = connection.recv(timeout=0)
+        except TimeoutError:
+            return
+        except (ConnectionClosed, OSError) as error:
+            raise self._fail(f"closed the connection ({error})", GoneError) from None
+        if isinstance(early, str):
+            raise self._fail(_reported(early), UnsentError)
+        raise self._fail("sent a message that nobody asked for: it must answer each message once", UnsentError)
 
     def _receive(self, end: float) -> str | bytes:
         if self._connection is None:
@@ -248,9 +275,7 @@ class RemoteClient:
 
     def _decode(self, frame: str | bytes, what: str, foreign: bool) -> Any:
         if isinstance(frame, str):
-            # openpi sends a whole traceback; its last line is the error.
-            lines = frame.strip().splitlines() or [""]
-            raise self._fail(f"reported an error: {lines[-1][:300]}")
+            raise self._fail(_reported(frame))
         try:
             return unpack_any(frame) if foreign else unpack(frame)
         except ProtocolError as error:
@@ -259,6 +284,12 @@ class RemoteClient:
     def _fail(self, reason: str, kind: type[RemoteError] = RemoteError) -> RemoteError:
         self.close()
         return kind(f"{self.url}: {reason}")
+
+
+def _reported(text: str) -> str:
+    """What a text message says went wrong: openpi sends a whole traceback, whose last line is the error."""
+    lines = text.strip().splitlines() or [""]
+    return f"reported an error: {lines[-1][:300]}"
 
 
 def _cameras(observation: Observation) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import time
+from collections.abc import Sequence
 
 from osel_sim.core.errors import RemoteError, UsageError
 from osel_sim.formats.policy_file import PolicySpec
@@ -11,7 +12,7 @@ from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Observation
 from osel_sim.policy.environment_fit import check_environment
 from osel_sim.policy.mapping import message_of
-from osel_sim.remote.client import Answer, HungUpError, NoAnswerError, RemoteClient
+from osel_sim.remote.client import Answer, HungUpError, NoAnswerError, RemoteClient, UnsentError
 from osel_sim.remote.network import Delays, NetworkModel, NetworkProfile, profile
 from osel_sim.remote.process import PolicyServerProcess
 from osel_sim.remote.protocol import STATE, TOKEN_VARIABLE, Greeting, example_observation, select_observation
@@ -51,6 +52,7 @@ class RemotePolicy:
         self._broken: str | None = "no episode was started"
         self._instruction = ""
         self._kept = self._begun = False  # the connection is older than the episode; a call of the episode was answered
+        self._sent = False
 
     def reset(self, instruction: str, seed: tuple[int, ...]) -> None:
         """Start a new episode, on a new connection if the last one broke. A server that cannot be reached makes the calls fail, not this."""
@@ -78,7 +80,7 @@ class RemotePolicy:
         megabytes = 1e-6 * sum(sizes)
         deadline = self._remote.deadline
         if answer is None:
-            return Call(None, upload=deadline, measured_seconds=measured, failure=self._broken)
+            return Call(None, upload=deadline, measured_seconds=measured, failure=self._broken, sent=self._sent)
         if delays.total > deadline:
             upload, inference, download = _cut(delays, deadline)
             failure = OUTAGE if delays.total - delays.outage <= deadline else DEADLINE
@@ -101,7 +103,8 @@ class RemotePolicy:
         self._client.reset(self._instruction)
 
     def _ask(self, observation: Observation) -> Answer | None:
-        if self._broken is not None:
+        self._sent = self._broken is None
+        if not self._sent:
             return None
         seen = select_observation(observation, self._spec.cameras, STATE in observation)
         try:
@@ -113,7 +116,7 @@ class RemotePolicy:
                 self._start_over()
                 answer = self._client.act(seen)
         except RemoteError as error:
-            self._broken = self._reason(error)
+            self._broken, self._sent = self._reason(error), not isinstance(error, UnsentError)
             return None
         self._begun = True
         return answer
@@ -144,11 +147,10 @@ def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float |
     timeout = spec.remote.timeout if timeout is None else timeout
     start_timeout = max(start_timeout, timeout)
     if spec.remote.url is not None:
-        token = os.environ.get(TOKEN_VARIABLE)
-        client = RemoteClient(spec.remote.url, environment, token, timeout, Greeting.of(spec, environment), spec.mapping)
-        client.connect()
+        client = _connected(spec, environment, timeout)
         if client.foreign:
             client.close()
+            token = os.environ.get(TOKEN_VARIABLE)
             # A server that compiles its model with the first request takes long for it.
             _try_mapping(spec, environment, RemoteClient(spec.remote.url, environment, token, start_timeout, mapping=spec.mapping))
         return RemotePolicy(spec, client)
@@ -159,6 +161,37 @@ def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float |
         client.connect()
         undo.pop_all()
     return RemotePolicy(spec, client, server=server)
+
+
+def check_servers(specs: Sequence[PolicySpec], environment: EnvironmentSpec, timeout: float = 10.0) -> None:
+    """Connect to the servers that are not started here and hang up again, so that one that is not there is told of before anything is loaded.
+
+    Args:
+        specs: policies, of which only those with a `url` are tried.
+        environment: what they will drive.
+        timeout: real seconds for each.
+
+    Raises:
+        RemoteError: naming the policy: nobody there, the token refused or missing, or not a policy server.
+    """
+    for spec in specs:
+        if spec.remote is not None and spec.remote.url is not None:
+            _connected(spec, environment, timeout).close()
+
+
+def _connected(spec: PolicySpec, environment: EnvironmentSpec, timeout: float) -> RemoteClient:
+    """A connection to the `url` of a policy file.
+
+    Raises:
+        RemoteError: naming the policy.
+    """
+    url = spec.remote.url if spec.remote else None
+    client = RemoteClient(url or "", environment, os.environ.get(TOKEN_VARIABLE), timeout, Greeting.of(spec, environment), spec.mapping)
+    try:
+        client.connect()
+    except RemoteError as error:
+        raise RemoteError(f"policy {spec.name!r} ({spec.file}): {error}") from None
+    return client
 
 
 def _try_mapping(spec: PolicySpec, environment: EnvironmentSpec, client: RemoteClient) -> None:

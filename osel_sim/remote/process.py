@@ -3,12 +3,12 @@
 import contextlib
 import json
 import os
-import queue
 import secrets
 import subprocess
 import sys
 import tempfile
-import threading
+import time
+from multiprocessing.connection import wait
 from typing import IO, Self
 
 from osel_sim.core.errors import RemoteError
@@ -23,6 +23,8 @@ ERROR_LINES = 5
 
 class PolicyServerProcess:
     """Runs `python -m osel_sim.serve` for one policy file.
+
+    It says where it listens on a pipe of its own: standard output belongs to whatever is loaded into it, and is kept with its errors.
 
     The token is random and travels through the environment, since anybody may read a command line. The server watches its standard input: when this
     process dies, however it dies, the pipe ends and the server goes too.
@@ -71,17 +73,22 @@ class PolicyServerProcess:
         self.token = secrets.token_urlsafe(32)
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed in close()
         name, folder, environment = self._spec.file.stem, str(self._spec.file.parent), json.dumps(self._environment.to_dict())
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "osel_sim.serve", name, "--port=0", "--policies-dir", folder, "--environment", environment, "--watch-stdin"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=self._errors,
-            env={**os.environ, TOKEN_VARIABLE: self.token},
-            text=True,
-            start_new_session=True,  # Ctrl-C is for the parent, which may still need answers to finish
-        )
+        ours, theirs = os.pipe()
+        flags = ["--port=0", f"--policies-dir={folder}", f"--environment={environment}", "--watch-stdin", f"--ready-fd={theirs}"]
         try:
-            self.url = self._wait_for_url(self._process)
+            with open(ours, "rb", buffering=0) as ready:
+                with open(theirs, "wb"):
+                    self._process = subprocess.Popen(
+                        [sys.executable, "-m", "osel_sim.serve", name, *flags],
+                        stdin=subprocess.PIPE,
+                        stdout=self._errors,
+                        stderr=self._errors,
+                        env={**os.environ, TOKEN_VARIABLE: self.token},
+                        text=True,
+                        start_new_session=True,  # Ctrl-C is for the parent, which may still need answers to finish
+                        pass_fds=[theirs],
+                    )
+                self.url = self._wait_for_url(self._process, ready)
         except BaseException:
             self.close()
             raise
@@ -105,30 +112,26 @@ class PolicyServerProcess:
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-            for pipe in (process.stdin, process.stdout):
-                if pipe is not None:
-                    pipe.close()
+            if process.stdin is not None:
+                process.stdin.close()
         if self._errors is not None:
             self._errors.close()
             self._errors = None
 
-    def _wait_for_url(self, process: subprocess.Popen[str]) -> str:
-        """The first line of the server's output names its address."""
-        lines: queue.Queue[str] = queue.Queue()
-        output = process.stdout
-        if output is None:
-            raise RemoteError("the policy server has no output")
-        threading.Thread(target=lambda: lines.put(output.readline()), daemon=True).start()
-        try:
-            line = lines.get(timeout=self._start_timeout)
-        except queue.Empty:
-            raise RemoteError(
-                f"the policy server of {self._spec.name!r} was not ready within {self._start_timeout:g} s{self._last_lines()}"
-            ) from None
-        try:
-            return str(json.loads(line)["url"])
-        except (ValueError, KeyError, TypeError):
-            raise RemoteError(f"the policy server of {self._spec.name!r} did not start{self._last_lines()}") from None
+    def _wait_for_url(self, process: subprocess.Popen[str], ready: IO[bytes]) -> str:
+        """The line that the server writes when it listens names its address."""
+        end, line = time.monotonic() + self._start_timeout, b""
+        while not line.endswith(b"\n"):
+            ended = process.poll() is not None  # asked first, so that what it wrote before its end is read
+            if wait([ready.fileno()], 0.1):
+                part = ready.read(4096)
+                line += part
+                ended = ended or not part
+            elif not ended and time.monotonic() > end:
+                raise RemoteError(f"the policy server of {self._spec.name!r} was not ready within {self._start_timeout:g} s{self._last_lines()}")
+            if ended and not line.endswith(b"\n"):
+                raise RemoteError(f"the policy server of {self._spec.name!r} did not start{self._last_lines()}")
+        return str(json.loads(line)["url"])
 
     def _last_lines(self) -> str:
         if self._errors is None:

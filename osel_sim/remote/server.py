@@ -15,10 +15,11 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from osel_sim.core.errors import OselError, PolicyError, RemoteError
+from osel_sim.core.errors import OselError, PolicyError
 from osel_sim.interface.policy import Policy
 from osel_sim.policy.local import check_form
 from osel_sim.policy.registry import MakeSession
+from osel_sim.remote.address import cannot_listen
 from osel_sim.remote.codec import ProtocolError, pack, unpack
 from osel_sim.remote.protocol import (
     HEALTH,
@@ -112,7 +113,7 @@ class PolicyServer:
                 ping_timeout=120,  # a client that simulates or compiles may be silent for long
             )
         except OSError as error:
-            raise RemoteError(f"cannot listen on {self._host}:{self._port} ({error.strerror or error})") from None
+            raise cannot_listen(self._host, self._port, error) from None
         try:
             ready(server.sockets[0].getsockname()[1])
             await stop.wait()

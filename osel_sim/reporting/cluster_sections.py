@@ -115,7 +115,7 @@ def frontier_figure(log: LoggedOutcomes, weights: RewardWeights, routing: Routin
     look = _frontier_look(log.policies, replayed)
     panels: list[Panel] = []
     for found in routing.ranges:
-        against = "price" if found.axis == "alpha_price" else "steps" if weights.time_unit == "steps" else "seconds"
+        against = "price" if found.axis == "alpha_price" else weights.clock
         x_label = "mean price (cents)" if against == "price" else f"mean {against}"
         other = "alpha_price" if found.axis == "alpha_time" else "alpha_time"
         paths: list[Path] = []

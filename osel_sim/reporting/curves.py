@@ -57,14 +57,15 @@ def curves(
     x_axis = alt.X("x:Q", title=axes[0], scale=alt.Scale(domain=ends, nice=False, zero=False), axis=alt.Axis(grid=False, tickCount=8, **counted))
     y_axis = alt.Y("y:Q", title=axes[1], scale=y_scale, axis=alt.Axis(tickCount=6))
     interpolate: Any = "step-after" if steps else "linear"
+    clip = _goes_beyond(lines, y_domain)
     layers: list[alt.Chart] = []
     if any(line.low is not None for line in lines):
-        band = base.mark_area(opacity=0.16, clip=True, interpolate=interpolate)
+        band = base.mark_area(fillOpacity=0.16, clip=clip, interpolate=interpolate)
         layers.append(
             band.encode(x=x_axis, y=alt.Y("low:Q", title=axes[1], scale=y_scale, axis=alt.Axis(tickCount=6)), y2="high:Q", color=look.color())
         )
     layers.append(
-        base.mark_line(strokeWidth=2, clip=True, interpolate=interpolate).encode(x=x_axis, y=y_axis, color=look.color(), strokeDash=look.dash())
+        base.mark_line(strokeWidth=2, clip=clip, interpolate=interpolate).encode(x=x_axis, y=y_axis, color=look.color(), strokeDash=look.dash())
     )
     layers.append(_told(places, [line for line in lines if line.name not in look.hidden], axes[0]))
     return panel(title, HEIGHT, *layers)
@@ -94,6 +95,14 @@ def settled_domain(x: ArrayLike, lines: Sequence[Line]) -> tuple[float, float] |
         return None
     margin = 0.06 * max(float(known.max() - known.min()), 1e-6)
     return float(known.min()) - margin, float(known.max()) + margin
+
+
+def _goes_beyond(lines: Sequence[Line], y_domain: tuple[float, float] | None) -> bool:
+    """Whether some line or band leaves the panel. Cutting them off takes most of the time that a picture takes to make."""
+    if y_domain is None:
+        return False
+    parts = [np.asarray(part, np.float64) for line in lines for part in (line.y, line.low, line.high) if part is not None]
+    return any(bool(((part < y_domain[0]) | (part > y_domain[1])).any()) for part in parts)
 
 
 def _record(x: NDArray[np.float64], line: Line) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """The episodes of a log or a live run as the page's script reads them: columns of numbers, instances once, videos small or linked."""
 
 import base64
+import functools
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -142,6 +143,12 @@ def _videos(videos: Mapping[tuple[int, int], Path], beside: Path) -> dict[str, d
 
 def frames(file: Path, count: int = _FRAMES) -> list[bytes]:
     """A few frames of a video, spread evenly, as small JPEGs; none where it cannot be read."""
+    return _frames(file, count, file.stat().st_mtime_ns if file.exists() else 0)
+
+
+@functools.lru_cache(1000)
+def _frames(file: Path, count: int, changed: int) -> list[bytes]:
+    """The frames; a page that grows asks for the same films again and again."""
     import imageio.v3
 
     try:

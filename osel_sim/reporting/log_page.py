@@ -2,36 +2,41 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from osel_sim.analysis.clusters import complete_rows
 from osel_sim.analysis.estimate import Estimate
+from osel_sim.analysis.evaluation import evaluate
 from osel_sim.analysis.log import LoggedOutcomes
-from osel_sim.analysis.outcomes import remote_policies
+from osel_sim.analysis.logged_choices import choices_of, has_choices
+from osel_sim.analysis.outcomes import overall, remote_policies
 from osel_sim.core.errors import DataError
-from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.formats.rollout_log import Row, read_rollouts
 from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, cluster_blocks, frontier_figure, weights_blocks
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_sections import context_figure, formula, policy_blocks, rates_table, time_figure
+from osel_sim.reporting.off_policy_section import off_policy_table, off_policy_verdict
 from osel_sim.reporting.page import Block, Page, Section, Tile, Verdict
 from osel_sim.reporting.routes import route_figure
 from osel_sim.selection.reward import RewardWeights
 
 
-def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_scenes) -> Page:
+def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_scenes, rows: Sequence[Row] | None = None) -> Page:
     """The page of a rollout log: what its policies came to, and whether there is something to route by.
 
     Args:
         scenes: draws how some of its instances begin.
+        rows: of the log; None: read from its folder.
 
     Raises:
         DataError: the log lacks what the weights ask for.
     """
     sections, routing = log_sections(log, weights)
+    found = evaluate(choices_of(log), weights) if has_choices(log) else None
+    if found is not None:
+        sections.insert(0, Section("off_policy", "Other ways of choosing", [off_policy_table(found)]))
     title = f"{few(sorted(set(log.labels('task'))))}: {len(log):,} instances, {len(log.policies)} policies"
-    rows, _ = read_rollouts(log.source)
+    rows = read_rollouts(log.source)[0] if rows is None else rows
     episodes = list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes(log))
-    verdict = _verdict(log, weights, routing)
+    verdict = off_policy_verdict(found) if found is not None else _verdict(log, weights, routing)
     return Page("Rollout log", title, verdict, sections, log_facts(log, weights), episodes, route_figure(log, weights))
 
 
@@ -108,10 +113,12 @@ def _verdict(log: LoggedOutcomes, weights: RewardWeights, routing: Routing | Non
     rewards = log.mean_rewards(weights)[complete_rows(log, weights)]
     means = rewards.mean(axis=0)
     best, oracle = int(means.argmax()), float(rewards.max(axis=1).mean())
-    success = float(np.nanmean(log.success[:, best]))
+    always = overall(log, weights)[best]  # as the table of policies has it
+    reward, success = always.reward, always.success
+    rate = f"95% [{100 * success.low:.0f}, {100 * success.high:.0f}]" if success else ""
     tiles = [
-        Tile("best single policy", log.policies[best], f"mean reward {means[best]:.3f}"),
-        Tile("its success", f"{100 * success:.0f}%"),
+        Tile("best single policy", log.policies[best], f"mean reward {reward.value:.3f}, 95% {interval(reward)}" if reward else ""),
+        Tile("its success", f"{100 * success.value:.0f}%" if success else "–", rate),
         Tile("hindsight oracle", f"{oracle:.3f}", "mean reward; optimistic, not learnable where outcomes are noisy"),
     ]
     held_out = routing.inequality.held_out if routing else None

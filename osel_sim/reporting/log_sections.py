@@ -34,8 +34,7 @@ _CLOUD_COLOURS = 12
 def formula(weights: RewardWeights) -> str:
     """The reward in words."""
     score = "share of subgoals" if weights.success == "subgoals" else weights.success
-    time = "steps" if weights.time_unit == "steps" else "log10(seconds)"
-    return f"reward = {score} \u2212 {weights.alpha_time:g} · {time} \u2212 {weights.alpha_price:g} · cents"
+    return f"reward = {score} \u2212 {weights.alpha_time:g} · {weights.time_text} \u2212 {weights.alpha_price:g} · cents"
 
 
 def score_label(weights: RewardWeights) -> tuple[str, float]:

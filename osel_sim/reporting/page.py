@@ -101,6 +101,25 @@ class Page:
         object.__setattr__(self, "tables", tuple(block for block in blocks if isinstance(block, Table)))
 
 
+@dataclass(frozen=True)
+class Live:
+    """What is said on a page that grows.
+
+    Attributes:
+        version: a browser that has another one loads the page again.
+        film: address of the last film, or empty.
+        words: what that shows.
+        decisions: how many there are so far.
+        over: no more will come.
+    """
+
+    version: int
+    film: str = ""
+    words: str = ""
+    decisions: int = 0
+    over: bool = False
+
+
 def write_page(page: Page, folder: Path) -> Path:
     """Write `figures/`, `tables/` and last `report.html` into a folder. Each file appears at once or not at all, and none if one cannot be made."""
     files = {f"{FIGURES}/{figure.name}.{ending}": image for figure in page.figures for ending, image in to_images(figure).items()}
@@ -113,29 +132,37 @@ def write_page(page: Page, folder: Path) -> Path:
     return folder / PAGE
 
 
-def to_html(page: Page) -> str:
-    """The page. Words from logs are escaped by the template, numbers and names for the script by `_embedded`."""
-    from jinja2 import Environment, StrictUndefined
+def to_html(page: Page, live: Live | None = None) -> str:
+    """The page. Words from logs are escaped by the template, numbers and names for the script by `_embedded`.
+
+    Args:
+        live: of a page that is served while it grows.
+    """
     from markupsafe import Markup
 
-    template = resources.files("osel_sim.reporting") / "template"
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalize)
     data = {
         "palette": {"light": LIGHT, "dark": DARK},
         "figures": {figure.name: figure.spec for figure in page.figures},
         "episodes": page.episodes.data if page.episodes else None,
     }
+    return _rendered("report.html.j2", page=page, parts=to_parts, live=live, vega=Markup(_vega()), data=Markup(_embedded(data)))
+
+
+def waiting_html(folder: Path, live: Live, problem: str = "") -> str:
+    """What is shown of a live run that has made no decision yet, or cannot be read."""
+    return _rendered("waiting.html.j2", folder=str(folder), live=live, problem=problem)
+
+
+def _rendered(name: str, **values: Any) -> str:
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup
+
+    template = resources.files("osel_sim.reporting") / "template"
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, finalize=_finalize)
     environment.filters["shown"] = shown
-    return environment.from_string((template / "report.html.j2").read_text(encoding="utf-8")).render(
-        page=page,
-        parts=to_parts,
-        light=LIGHT,
-        dark=DARK,
-        css=Markup((template / "report.css").read_text(encoding="utf-8")),
-        script=Markup((template / "report.js").read_text(encoding="utf-8")),
-        vega=Markup(_vega()),
-        data=Markup(_embedded(data)),
-    )
+    files = {"css": "report.css", "script": "report.js", "live_script": "live.js"}
+    own = {key: Markup((template / file).read_text(encoding="utf-8")) for key, file in files.items()}
+    return environment.from_string((template / name).read_text(encoding="utf-8")).render(light=LIGHT, dark=DARK, **own, **values)
 
 
 @cache

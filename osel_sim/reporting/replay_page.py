@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from osel_sim.analysis.clusters import score_of
+from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.frontier import measured
 from osel_sim.analysis.live import is_live_run, read_live
-from osel_sim.analysis.log import Array, LoggedOutcomes, read_log
-from osel_sim.analysis.measures import curves
+from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats, read_log
+from osel_sim.analysis.measures import curves, measure_fixed
 from osel_sim.analysis.oracles import oracles
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.replay_result import REPLAY, Choices, read_replay
@@ -127,12 +128,14 @@ def _read(folder: Path, log_folder: Path | None) -> _Replay:
 def _page(replay: _Replay, scenes: Scenes) -> Page:
     result, choices, log, names, streams = replay.result, replay.choices, replay.log, replay.names, replay.streams
     weights, look, learners = replay.weights, replay.look, replay.learners
-    selectors: list[Block] = [curve_figure(streams, look), selector_table(result, names)]
+    told = _as_the_log_tells(result, log, weights)
+    selectors: list[Block] = [curve_figure(streams, look), selector_table(told, names)]
     gap = gap_figure({names[name]: gaps(entry) for name, entry in result["selectors"].items() if entry["kind"] == "learner"}, replay.learnable)
     regret = regret_figure(streams, [*_ends(result, names)[:1], *(word for word in ORACLES.values() if word in streams)], look)
     shares = share_figure({shown: streams[shown] for shown in learners.values()}, log.policies, look)
-    selectors += [block for block in (gap, regret, penalty_figure(streams, weights, look), shares) if block is not None]
-    selectors += [oracle_table(result), *paired_tables(result, names)]
+    penalty = penalty_figure(streams, weights, look, choices.order, _always(log, weights, names))
+    selectors += [block for block in (gap, regret, penalty, shares) if block is not None]
+    selectors += [oracle_table(told), *paired_tables(result, names)]
     selectors += [off_policy_table(result["off_policy"])] if result.get("off_policy") else []
     shared, _ = log_sections(log, weights, Replayed(_points(log, weights, choices, learners), result.get("frontier"), look))
     title = f"{few(result['log']['tasks'])}: {len(learners)} selectors over {choices.order.shape[1]:,} decisions, {len(choices.order)} seeds"
@@ -140,7 +143,7 @@ def _page(replay: _Replay, scenes: Scenes) -> Page:
     routes = route_figure(log, weights, _chosen(choices, who, names) if who in names else None)
     sections = [Section("selectors", "Selectors", selectors), *shared]
     facts, episodes = _facts(replay.folder, result, log, weights), _episodes(log, weights, choices, names, look, scenes(log))
-    return Page("Replay", title, _verdict(result), sections, facts, episodes, routes)
+    return Page("Replay", title, _verdict(told), sections, facts, episodes, routes)
 
 
 def _speaker(result: Mapping[str, Any]) -> str:
@@ -216,6 +219,27 @@ def _streams(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, name
         elif name in found.oracles:
             streams[shown] = Stream(found.oracles[name], *[nothing] * 5)
     return streams
+
+
+def _as_the_log_tells(result: Mapping[str, Any], log: LoggedOutcomes, weights: RewardWeights) -> dict[str, Any]:
+    """The result with what fixed policies come to over all repeats, as the table of policies has it, not over those that the streams drew."""
+    found = {policy: measure_fixed(log, weights, policy) for policy in log.policies}
+    selectors = {name: {**entry, **found.get(entry.get("policy"), {})} for name, entry in result["selectors"].items()}
+    best = found[result["selectors"]["best_single"]["policy"]]
+    single = result["oracles"]["best_single"] | {key: best[key] for key in ("mean_reward", "ci95")}
+    return {**result, "selectors": selectors, "oracles": {**result["oracles"], "best_single": single}}
+
+
+def _always(log: LoggedOutcomes, weights: RewardWeights, names: Mapping[str, str]) -> dict[str, tuple[Estimate | None, Estimate | None]]:
+    """What the reward counts as success, and what it takes off, of each fixed policy by its name on the page, as the table of policies has them."""
+    score = score_of(log, weights)
+    penalty = score - log.rewards(weights)
+    of_score = rate_of if weights.success == "success" else lambda values: mean_of(mean_over_repeats(values))
+    return {
+        names[f"fixed:{policy}"]: (of_score(score[:, column]), mean_of(mean_over_repeats(penalty[:, column])))
+        for column, policy in enumerate(log.policies)
+        if f"fixed:{policy}" in names
+    }
 
 
 def _points(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str]) -> dict[str, dict[str, float]]:

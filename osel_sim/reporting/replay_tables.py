@@ -58,8 +58,11 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
         *(Column(f"regret_{oracle}", f"regret to {word}", digits=3) for oracle, word in ORACLES.items() if oracle in result["oracles"]),
         Column("ahead", "ahead after"),
     ]
+    over = _over_seeds(result)
     caption = (
-        f"{_over_seeds(result)} The best first. Those of the gap are also over what the expected oracle may be off; a gap without one may be none. "
+        "The best first. Mean reward and success: with 95% bootstrap intervals over instances, of fixed policies over all repeats as in the table of "
+        f"policies. Gap and regret: {over[:1].lower()}{over[1:]} Those of the gap are also over what the expected oracle may be off; a gap without "
+        "one may be none. "
         "Regret: reward a decision below the oracle. Gap closed: share of the way "
         f"from the best single policy to the learnable oracle{'' if predictable else ', in the last quarter also to the predictable one'}. "
         "Ahead after: decisions until its rewards pass the best single policy's for good."
@@ -72,7 +75,7 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
 def _measures(reward: Mapping[str, Any]) -> dict[str, tuple[str, int | None]]:
     """Which means a table of selectors shows besides reward and success, with their headings and digits: what the reward is made of."""
     graded = {"subgoals": {"mean_subgoals": ("subgoals", 2)}, "score": {"mean_score": ("score", 4)}}.get(reward["success"], {})
-    time = {"mean_steps": ("steps", 0)} if reward["time_unit"] == "steps" else {"mean_seconds": ("seconds", 2)}
+    time = {"mean_steps": ("steps", 0)} if reward["time_unit"].endswith("steps") else {"mean_seconds": ("seconds", 2)}
     return {**graded, **time, "mean_price": ("price (cents)", None)}
 
 

@@ -1,7 +1,7 @@
 """The page of a live run."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from osel_sim.analysis.clusters import score_of
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.evaluation import evaluate
-from osel_sim.analysis.live import JOURNAL, LiveLog, read_live
+from osel_sim.analysis.live import LiveLog, read_live
 from osel_sim.analysis.log import FLAGS, Array, LoggedOutcomes
 from osel_sim.core.errors import DataError
-from osel_sim.core.files import read_json
-from osel_sim.formats.journal import Decision, read_journal
-from osel_sim.formats.run_config import RUN
+from osel_sim.formats.journal import Decision
+from osel_sim.formats.run_config import read_run
 from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, thinned
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, note_of
@@ -28,6 +27,7 @@ from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdic
 from osel_sim.reporting.palette import colours
 from osel_sim.reporting.routes import Chosen, route_figure
 from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, look_of, penalty_figure, regret_figure
+from osel_sim.selection.registry import RECOMMENDATION, is_recommended
 from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
 from osel_sim.statistics.betting import advantage_bounds
 
@@ -53,7 +53,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     look = _look(run, streams)
     blocks: list[Block] = [curve_figure(streams, look, run.log.policies)]
     if HINDSIGHT in streams:
-        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look)]
+        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look, np.arange(len(run.chosen))[None])]
     blocks += [_propensities(run), _chosen_table(run, selector)]
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
@@ -105,11 +105,7 @@ class _Run:
 
 def _read(folder: Path) -> _Run:
     live = read_live(folder)
-    try:
-        weights = RewardWeights(**live.reward)
-    except TypeError as error:
-        raise DataError(f"{folder / RUN}: configuration.reward does not have the promised form ({error})") from None
-    return _Run(folder, live, read_journal(folder / JOURNAL), weights)
+    return _Run(folder, live, live.decisions, RewardWeights(**live.reward))
 
 
 def _streams(run: _Run, selector: str) -> dict[str, Stream]:
@@ -171,6 +167,11 @@ def _chosen_table(run: _Run, selector: str) -> Table:
 
 
 def _verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
+    verdict = _own_verdict(run, selector, streams)
+    return verdict if is_recommended(selector) else replace(verdict, sentences=[*verdict.sentences, f"{RECOMMENDATION}."])
+
+
+def _own_verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
     own = streams[selector]
     reward, success = mean_of(own.reward), rate_of(own.success.T)
     rate = f"95% [{100 * success.low:.0f}, {100 * success.high:.0f}]" if success else ""
@@ -183,7 +184,8 @@ def _verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
         sentence = "What the other policies would have done is not known: run with --counterfactual to compare."
         return Verdict(f"{selector} received {reward.value:.3f} a decision" if reward else f"{selector} received nothing", [sentence], tiles)
     fixed = {name: stream for name, stream in streams.items() if name.startswith("always ")}
-    best = max(fixed, key=lambda name: float(np.nanmean(fixed[name].reward)))
+    known = {name: stream.reward[np.isfinite(stream.reward)] for name, stream in fixed.items()}
+    best = max(fixed, key=lambda name: float(known[name].mean()) if known[name].size else -np.inf)
     differences = own.reward - fixed[best].reward
     differences = differences[np.isfinite(differences)]
     if not differences.size:
@@ -219,7 +221,7 @@ def _mean_tiles(stream: Stream) -> list[Tile]:
 
 
 def _facts(run: _Run) -> list[tuple[str, str]]:
-    ran_with = read_json(run.folder / RUN).get("environment", {})
+    ran_with = read_run(run.folder)["environment"]
     own = {key: value for key, value in run.configuration.items() if key not in ("reward", "content")}
     facts = [("folder", str(run.folder)), *((key, _words(value)) for key, value in own.items()), ("reward", formula(run.weights))]
     facts += [(name, str(digest)[:12]) for name, digest in dict(run.configuration.get("content") or {}).items()]

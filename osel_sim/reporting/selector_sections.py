@@ -2,11 +2,12 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
+from osel_sim.analysis.estimate import Estimate, mean_of, over_instances, rate_of
 from osel_sim.analysis.log import Array
 from osel_sim.reporting.areas import stacked
 from osel_sim.reporting.charts import Figure, Look, Panel, listed
@@ -112,16 +113,28 @@ def regret_figure(streams: Mapping[str, Stream], references: Sequence[str], look
     return Figure("regret", "Regret", caption, text, panels, look.hidden)
 
 
-def penalty_figure(streams: Mapping[str, Stream], weights: RewardWeights, look: Look) -> Figure:
-    """Success against the weighted sum of time and price (paper, figure 6)."""
+def penalty_figure(
+    streams: Mapping[str, Stream],
+    weights: RewardWeights,
+    look: Look,
+    instances: NDArray[Any],
+    always: Mapping[str, tuple[Estimate | None, Estimate | None]] | None = None,
+) -> Figure:
+    """Success against the weighted sum of time and price (paper, figure 6).
+
+    Args:
+        instances: (S, T), which instance was decided on.
+        always: score and penalty of fixed policies, from a log that has more repeats than the streams drew.
+    """
     label, scale = score_label(weights)
     dots: list[Dot] = []
     for name, stream in streams.items():
-        score, penalty = over_seeds(stream.score), over_seeds(stream.penalty)
+        score, penalty = (always or {}).get(name) or (_mean_over(stream.score, instances), _mean_over(stream.penalty, instances))
         if score is not None and penalty is not None:
             dots.append(Dot(name, penalty, Estimate(scale * score.value, scale * score.low, scale * score.high)))
     caption = (
-        "Means over all decisions with 95% intervals (the paper's figure 6). Up and to the left is better; reward is height minus way to the right. "
+        "Means over all decisions with 95% intervals over instances (the paper's figure 6). Up and to the left is better; reward is height minus way "
+        "to the right. "
         "Diamonds: fixed policies; crosses: oracles. Dots that coincide stand side by side."
     )
     axes = ("alpha_time · time + alpha_price · cents (reward)", label)
@@ -178,16 +191,12 @@ def gap_figure(gaps: Mapping[str, tuple[Estimate | float | None, Estimate | floa
     return Figure("gap_closed", "Share of the learnable gap closed", caption, text, [panel])
 
 
-def over_seeds(values: Array) -> Estimate | None:
-    """Mean over decisions and seeds (S, T), with the interval over seeds; of a single seed, that over its decisions."""
-    known = np.isfinite(values)
-    if not known.any():
-        return None
-    means = np.array([row[mask].mean() for row, mask in zip(values, known, strict=True) if mask.any()])
-    if len(means) == 1:
-        return rate_of(values.T) if np.isin(values[known], (0.0, 1.0)).all() else mean_of(values)
-    half = _NORMAL * float(means.std(ddof=1)) / np.sqrt(len(means))
-    return Estimate(float(means.mean()), float(means.mean() - half), float(means.mean() + half))
+def _mean_over(values: Array, instances: NDArray[Any]) -> Estimate | None:
+    """Mean over decisions and seeds (S, T) with its interval over instances; of yes and no in a single stream Wilson's."""
+    known = values[np.isfinite(values)]
+    if len(values) == 1 and np.isin(known, (0.0, 1.0)).all():
+        return rate_of(values.T)
+    return mean_of(values) if len(values) == 1 else over_instances(values, instances)
 
 
 def _lines(values: Mapping[str, Array], most: int = 100) -> tuple[NDArray[np.int64], list[Line]]:

@@ -2,29 +2,34 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import solve_triangular
 
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.files import content_digest
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.features import Array, Features, Sketch
+from osel_sim.selection.regression import Moments, SharedRegression, fit
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
 from osel_sim.statistics.best import probability_of_best
 
-INTERCEPT = 0.5
-"""Prior variance of a policy's mean reward, in units of the noise. Strong: no context is needed to find the best single policy."""
+MEAN = 1.0
+"""Prior variance of a policy's mean reward, its own and what all have in common, relative to the noise: one decision outweighs it."""
 
-NOISE, NOISE_WEIGHT = 0.2, 4.0
-"""Prior guess of the noise's variance (a success of probability 0.3 to 0.7 has 0.2) and how many decisions that guess is worth."""
+DEVIATION = 0.5
+"""Standard deviation of rewards to expect before any two have differed: that of a success with probability 1/2."""
 
-CENTRE = 0.5
-"""Prior guess of a policy's reward + cost, worth one decision: as many successes as failures."""
+FEW = 12.0
+"""A policy's mean after n decisions is drawn with 1 + FEW * n / (n + 1)^2 times the Gaussian's variance: a success is not Gaussian at all, so that
+after two failures that would be far too sure of the next, and policies that had bad luck at first would never be tried again."""
+
+NOTHING = 1e-6
+"""Prior variance, relative to the noise, of what is not there; 0 could not be inverted."""
 
 GROWTH = 1.25
 """Features and evidence are computed afresh whenever there are this many times as many decisions."""
@@ -38,8 +43,11 @@ class Prior:
     """What a `BayesianSelector` is told before its first decision, and how it explores.
 
     Attributes:
-        signals: candidates for the prior variance of w relative to the noise, > 0.
-        optimism, chance: weights of the two ways to explore, >= 0.
+        signals: candidates for the prior variance of how policies differ by context, relative to the noise, > 0; a signal of nothing is always one.
+        shared: candidates for the prior variance of what contexts change for all policies alike, relative to the noise, >= 0.
+        optimism, chance: weights of two ways to explore what a policy's success in this context is, >= 0.
+        mean_optimism, mean_chance: the same for what its success is in any context.
+        floor: the probability with which the n-th choice is made at random is floor / sqrt(n), half at most; in [0, 1].
         expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
             learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
         warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
@@ -50,30 +58,49 @@ class Prior:
     """
 
     signals: Sequence[float]
+    shared: Sequence[float] = (0.0,)
     optimism: float = 0.0
     chance: float = 0.0
+    mean_optimism: float = 0.0
+    mean_chance: float = 0.0
+    floor: float = 0.0
     expected_costs: Mapping[str, float] | None = None
     warm_contexts: ArrayLike | None = None
     skills: Skills | None = None
 
     def __post_init__(self) -> None:
-        for name, value in (("optimism", self.optimism), ("chance", self.chance)):
+        for name in ("optimism", "chance", "mean_optimism", "mean_chance"):
+            value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise UsageError(f"{name} must be finite and >= 0, got {value}")
+        if not 0.0 <= self.floor <= 1.0:
+            raise UsageError(f"floor must lie in [0, 1], got {self.floor}")
         if not self.signals or not all(math.isfinite(signal) and signal > 0.0 for signal in self.signals):
             raise UsageError(f"signals must be one or more finite numbers > 0, got {list(self.signals)}")
+        if not self.shared or not all(math.isfinite(signal) and signal >= 0.0 for signal in self.shared):
+            raise UsageError(f"shared must be one or more finite numbers >= 0, got {list(self.shared)}")
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """How it explores and what it considers, as JSON values."""
+        lists = {"signals": [float(value) for value in self.signals], "shared": [float(value) for value in self.shared]}
+        return {**lists, **{name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}}
 
 
 class BayesianSelector(SelectorBase):
     """Regresses reward plus declared cost on features of the context and chooses by mean, uncertainty and chance.
 
-    Model: reward + cost = centre + a_policy + w_policy . features + noise, all Gaussian. How much the context matters (the variance of w) and how
-    large the noise is are learned from the evidence. Where the context does not help that variance goes to nothing, and what remains is a bandit on
-    the policies' means. With declared skills there are two centres and two a_policy, for what a policy declares and for what it does not.
+    Model: reward + cost = mean of all + mean of the policy + (shared + own of the policy) . features + noise, all Gaussian
+    (`osel_sim.selection.regression`). How much the context matters, to all policies alike and to the differences between them, and how large the
+    noise is, is learned from the evidence. Where the context does not help its weights go to nothing, and what remains is a bandit on the
+    policies' means. With declared skills every mean is two, one where the policy declares what is asked for and one where it does not.
 
-    A policy's score is mean + deviation * (`optimism` * sqrt(1 + log(1 + n) / 4) + `chance` * standard normal), n being how many decisions told about
-    contexts like this one, and the highest score is chosen: optimism alone is UCB, chance alone Thompson sampling. The logarithm makes sure that a
-    policy that was unlucky at first is tried again.
+    Rewards are measured from their centre and in units of their standard deviation, so that their scale and offset change nothing.
+
+    Of a policy's variance one part would be there without any context, that of its mean by as many decisions: `mean`. The rest is the `context`'s.
+    A policy's score is its expected reward + mean_optimism * sqrt(mean) + optimism * sqrt(context) + a normal variable of variance
+    mean_chance^2 * mean * (1 + FEW * n / (n + 1)^2) + chance^2 * context, n being its decisions, and the highest score is chosen:
+    optimism alone is UCB, chance alone Thompson sampling.
 
     Whenever the number of decisions has grown by a quarter, features are fitted afresh to the contexts seen so far, and the regression is computed
     again on them; in between it is updated decision by decision.
@@ -92,133 +119,118 @@ class BayesianSelector(SelectorBase):
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, features: Features, prior: Prior) -> None:
         super().__init__(policies, context_dim, seed)
-        self._skills = prior.skills
+        self._prior, self._skills = prior, prior.skills
         if self._skills is not None and self._skills.dimension != context_dim:
             raise UsageError(f"the examples of skills have length {self._skills.dimension}, contexts {context_dim}")
         costs = prior.expected_costs
         self._costs_declared = None if costs is None else {name: float(cost) for name, cost in costs.items()}
         self._costs = np.array([self._cost(name) for name in self.policies])
-        self._signals = [float(signal) for signal in prior.signals]
-        self.optimism, self.chance = float(prior.optimism), float(prior.chance)
         self._sketch = Sketch(context_dim)
         self._warm, self._warm_digest = self._check_warm(prior.warm_contexts)
         self._features = features
         self._generator = np.random.default_rng(seed)
+        self._guess = np.zeros(1) if self._skills is None else np.array([DECLARED, NOT_DECLARED])
         self._contexts: list[NDArray[np.float32]] = []
-        self._head_count = 1 if self._skills is None else 2
         self._heads: list[Array] = []
         self._chosen: list[int] = []
         self._targets: list[float] = []
-        self._signal, self._noise, self._next_fit = float(np.mean(self._signals)), NOISE, 2
-        # Of each policy's intercept(s) and weights, (policies, rows) and (policies, rows, rows); the covariances relative to the noise.
-        self._means, self._covariances = np.zeros((0, 0)), np.zeros((0, 0, 0))
+        self._counts = np.zeros(len(self.policies), np.int64)
+        self._next_fit = 1
+        self._centre, self._deviation, self._signal = 0.0, DEVIATION, 0.0
+        self._regression: SharedRegression
         self._fit()
 
     @property
     def settings(self) -> dict[str, Any]:
         """What every selector of this kind has; subclasses add theirs."""
-        return {
-            "signals": self._signals,
-            "optimism": self.optimism,
-            "chance": self.chance,
-            "expected_costs": self._costs_declared,
-            "warm_contexts": self._warm_digest,
-            "skills": None if self._skills is None else self._skills.digest,
-        }
+        told = {"expected_costs": self._costs_declared, "warm_contexts": self._warm_digest}
+        return {**self._prior.numbers, **told, "skills": None if self._skills is None else self._skills.digest}
 
     @property
     def signal(self) -> float:
-        """How much the context matters by the evidence so far: prior variance of a feature's weight relative to the noise."""
+        """How much the context matters to the differences between policies by the evidence so far: variance relative to the noise."""
         return self._signal
 
     def _select(self, context: Context) -> Choice:
-        rows = self._rows(context, self._sketch(context))
-        variances = np.maximum(((self._covariances @ rows[:, :, None])[:, :, 0] * rows).sum(axis=1), 1e-12)
-        deviations = np.sqrt(self._noise * variances)
-        # 1 / variance is how many decisions, this policy's, told about contexts like this one.
-        optimism = self.optimism * math.sqrt(1.0 + 0.25 * math.log1p((1.0 / variances).sum()))
-        scores = (self._means * rows).sum(axis=1) - self._costs + optimism * deviations
-        propensities = probability_of_best(scores, self.chance * deviations)
+        prior, rows = self._prior, self._rows(context, self._sketch(context))
+        means, variances = self._regression.predict(rows)
+        of_mean = np.minimum(variances, 1.0 / (self._counts + 1.0 / MEAN))
+        of_context = variances - of_mean
+        unit = self._deviation * math.sqrt(self._regression.noise)
+        hope = unit * (prior.mean_optimism * np.sqrt(of_mean) + prior.optimism * np.sqrt(of_context))
+        scores = self._deviation * (means + rows[:, : len(self._guess)] @ self._guess) - self._costs + hope
+        few = 1.0 + FEW * self._counts / (self._counts + 1.0) ** 2
+        chance = prior.mean_chance**2 * few * of_mean + prior.chance**2 * of_context
+        propensities = probability_of_best(scores, unit * np.sqrt(chance))
+        random = min(0.5, prior.floor / math.sqrt(len(self._chosen) + 1))
+        propensities = (1.0 - random) * propensities + random / len(propensities)
         index = int(self._generator.choice(len(self.policies), p=propensities))
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         sketched, index = self._sketch(context), self.policies.index(choice.policy)
-        row = self._rows(context, sketched)[index]
-        target = reward + self._costs[index]
+        row, heads = self._rows(context, sketched)[index], len(self._guess)
         self._contexts.append(np.array(sketched))
-        self._heads.append(row[: self._head_count].copy())
+        self._heads.append(row[:heads].copy())
         self._chosen.append(index)
-        self._targets.append(float(target))
-        if len(self._targets) >= self._next_fit:
-            self._fit()
-            self._next_fit = math.ceil(len(self._targets) * GROWTH)
+        self._counts[index] += 1
+        self._targets.append(float(reward + self._costs[index]))
+        if len(self._targets) < self._next_fit:
+            self._regression.update(index, row, self._standard(self._targets[-1]) - float(row[:heads] @ self._guess))
             return
-        step = self._covariances[index] @ row
-        variance = 1.0 + float(step @ row)
-        self._means[index] += step * ((target - self._means[index] @ row) / variance)
-        self._covariances[index] -= np.outer(step, step / variance)
+        self._fit()
+        self._next_fit = max(len(self._targets) + 1, math.ceil(len(self._targets) * GROWTH))
 
     def _fit(self) -> None:
-        """Features, evidence and regression from all that was seen; from the prior alone at first."""
+        """Scale, features, evidence and regression from all that was seen; from the prior alone at first."""
         contexts = np.array(self._contexts, np.float64).reshape(-1, self._sketch.dim)
         targets, chosen = np.array(self._targets), np.array(self._chosen, np.int64)
+        self._measure(chosen, targets)
+        targets = self._standard(targets)
         self._fit_features(np.concatenate([self._warm, contexts]), contexts, chosen, targets)
-        heads = np.array(self._heads, np.float64).reshape(-1, self._head_count)
+        heads = np.array(self._heads, np.float64).reshape(-1, len(self._guess))
         rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
-        if self._skills is None:
-            # The mean over policies, not decisions: how good the most chosen one is says little of those hardly tried.
-            counts, sums = (np.bincount(chosen, weights, len(self._costs)) for weights in (None, targets))
-            prior = np.array([((sums + CENTRE) / (counts + 1)).mean()])
-        else:
-            prior = np.array([DECLARED, NOT_DECLARED])
-        targets = targets - heads @ prior
-        parts = [(rows[chosen == policy], targets[chosen == policy]) for policy in range(len(self._costs))]
-        moments = np.stack([part.T @ part for part, _ in parts])
-        vectors = np.stack([part.T @ target for part, target in parts])
-        if len(targets):
-            evidence, noises = np.array([self._evidence(moments, vectors, targets, signal) for signal in self._signals]).T
-            weights = np.exp(evidence - evidence.max())
-            weights /= weights.sum()
-            self._signal, self._noise = float(weights @ np.array(self._signals)), float(weights @ noises)
-        scale = self._scale(self._signal)
-        self._covariances = scale[:, None] * np.linalg.inv(np.eye(len(scale)) + scale[:, None] * moments * scale) * scale
-        self._means = (self._covariances @ vectors[..., None])[..., 0]
-        self._means[:, : self._head_count] += prior
+        moments = Moments.of(rows, chosen, targets - heads @ self._guess, len(self._costs))
+        own = (NOTHING, *(float(signal) for signal in self._prior.signals)) if self._features.dim and len(targets) > 1 else (NOTHING,)
+        shared = [max(NOTHING, float(signal)) for signal in self._prior.shared] if len(own) > 1 else [NOTHING]
+        found = [regression for signal in own for regression in fit(moments, self._scale(signal), [self._scale(common) for common in shared])]
+        weights = np.exp(np.array([regression.evidence for regression in found]) - max(regression.evidence for regression in found))
+        weights = (weights / weights.sum()).reshape(len(own), len(shared))
+        self._signal = float(weights.sum(axis=1) @ np.array(own))
+        [self._regression] = fit(moments, self._scale(self._signal), [self._scale(float(weights.sum(axis=0) @ np.array(shared)))])
 
     def _fit_features(self, contexts: Array, own: Array, chosen: NDArray[np.int64], targets: Array) -> None:
-        """Fit `features` to contexts, warm ones included; `own` are those decided on."""
+        """Fit `features` to contexts, warm ones included; `own` are those decided on, `targets` (n,) what came of them, standardised."""
         if len(contexts):
             self._features.fit(contexts)
 
-    def _evidence(self, moments: Array, vectors: Array, targets: Array, signal: float) -> tuple[float, float]:
-        """Log probability of all rewards under this signal, the noise integrated out (inverse gamma prior), and the noise's mean."""
-        scale, count = self._scale(signal), NOISE_WEIGHT + len(targets)
-        factors = np.linalg.cholesky(np.eye(len(scale)) + scale[:, None] * moments * scale)
-        explained = sum(
-            float((solve_triangular(factor, scale * vector, lower=True, check_finite=False) ** 2).sum())
-            for factor, vector in zip(factors, vectors, strict=True)
-        )
-        noise = (NOISE_WEIGHT * NOISE + max(float(targets @ targets) - explained, 0.0)) / count
-        return -float(np.log(np.diagonal(factors, axis1=1, axis2=2)).sum()) - 0.5 * count * math.log(noise), noise
+    def _measure(self, chosen: NDArray[np.int64], targets: Array) -> None:
+        """Where rewards + costs lie and how far they spread. Until two of them differ the deviation is a guess, of which no choice depends."""
+        if not len(targets):
+            return
+        # The mean over policies, not decisions: how good the most chosen one is says little of those hardly tried.
+        counts, sums = (np.bincount(chosen, weights, len(self._costs)) for weights in (None, targets))
+        self._centre = float(((sums + targets.mean()) / (counts + 1))[counts > 0].mean())
+        deviation = math.sqrt(float(((targets - self._centre) ** 2).mean()))
+        if deviation > 1e-9 * abs(self._centre):
+            self._deviation = deviation
+
+    def _standard(self, targets: Any) -> Any:
+        return (targets - self._centre) / self._deviation
 
     def _scale(self, signal: float) -> Array:
-        """Prior deviations of the intercept and the weights, relative to the noise."""
-        return np.sqrt(np.concatenate([np.full(self._head_count, INTERCEPT), np.full(self._features.dim, signal)]))
+        """Prior variances of a mean, or two, and of the features' weights."""
+        return np.concatenate([np.full(len(self._guess), MEAN), np.full(self._features.dim, signal)])
 
     def _rows(self, context: Context, sketched: NDArray[np.float32]) -> Array:
-        """What the regressions see of a context, (policies, 1 + dim): a constant for the intercept, and the features.
+        """What the regression sees of a context, (P, 1 + dim): a constant for the mean, and the features.
 
-        With skills (policies, 2 + dim): how far a policy declares what is asked for, and how far not, instead of the constant. Each has its own
-        intercept, so that a policy which disappoints where it promised much is not thought worse of where it promised little.
+        With skills (P, 2 + dim): how far a policy declares what is asked for, and how far not, instead of the constant.
         """
-        if self._skills is None:
-            heads = np.ones((len(self.policies), 1))
-        else:
-            share = self._skills.share(context, self.policies)
-            heads = np.stack([share, 1.0 - share], axis=1)
         features = self._features.transform(sketched[None].astype(np.float64))
-        return np.concatenate([heads, np.repeat(features, len(heads), axis=0)], axis=1)
+        share = np.ones((len(self._costs), 1)) if self._skills is None else self._skills.share(context, self.policies)[:, None]
+        heads = share if self._skills is None else np.concatenate([share, 1.0 - share], axis=1)
+        return np.concatenate([heads, np.broadcast_to(features, (len(heads), features.shape[1]))], axis=1)
 
     def _cost(self, policy: str) -> float:
         if self._costs_declared is None:
@@ -240,25 +252,30 @@ class BayesianSelector(SelectorBase):
 
     def _add_policy(self, name: str) -> None:
         self._costs = np.append(self._costs, self._cost(name))
+        self._counts = np.append(self._counts, 0)
         self._fit()
 
     def _state(self) -> State:
         return {
             "contexts": np.array(self._contexts, np.float32).reshape(-1, self._sketch.dim),
-            "heads": np.array(self._heads, np.float64).reshape(-1, self._head_count),
+            "heads": np.array(self._heads, np.float64).reshape(-1, len(self._guess)),
             "chosen": np.array(self._chosen, np.int64),
             "targets": np.array(self._targets, np.float64),
-            "means": self._means.copy(),
-            "covariances": self._covariances.copy(),
-            "model": [self._signal, self._noise, self._next_fit],
+            "model": [self._centre, self._deviation, self._signal, self._next_fit],
             "random": self._generator.bit_generator.state,
+            **{f"regression.{key}": value for key, value in self._regression.state().items()},
             **{f"features.{key}": value for key, value in self._features.state().items()},
         }
 
     def _load(self, state: State) -> None:
         self._contexts, self._heads = list(state["contexts"].copy()), list(state["heads"].copy())
         self._chosen, self._targets = state["chosen"].tolist(), state["targets"].tolist()
-        self._means, self._covariances = state["means"].copy(), state["covariances"].copy()
-        self._signal, self._noise, self._next_fit = state["model"]
+        self._counts = np.bincount(state["chosen"], minlength=len(self.policies))
+        self._centre, self._deviation, self._signal, self._next_fit = state["model"]
         self._generator.bit_generator.state = state["random"]
-        self._features.load({key.removeprefix("features."): value for key, value in state.items() if key.startswith("features.")})
+        self._regression = SharedRegression(**{key: copy(value) for key, value in _part(state, "regression.").items()})
+        self._features.load(_part(state, "features."))
+
+
+def _part(state: State, prefix: str) -> State:
+    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}

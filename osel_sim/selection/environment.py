@@ -1,5 +1,6 @@
 """The selection problem as a Gymnasium environment, so that any stable-baselines3 algorithm runs on it."""
 
+import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -36,8 +37,14 @@ class SelectionEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
         self._round: Round | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Draw the next round; its context is the observation."""
+        """Draw the next round; its context is the observation.
+
+        Raises:
+            UsageError: there are options; it knows none.
+        """
         super().reset(seed=seed)
+        if options:
+            raise UsageError(f"unknown option of reset {next(iter(options))!r}: a round has none")
         self._round = self._draw(self.np_random)
         return self._round[0].copy(), {}
 
@@ -46,11 +53,18 @@ class SelectionEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
 
         Raises:
             gymnasium.error.ResetNeeded: called twice without `reset` in between.
+            UsageError: the action is no index of a policy.
         """
+        try:
+            index = operator.index(-1 if isinstance(action, bool) else action)
+        except TypeError:
+            index = -1
+        if not 0 <= index < len(self.policies):
+            raise UsageError(f"an action must be the index of a policy, an integer in [0, {len(self.policies) - 1}], got {action!r}")
         if self._round is None:
             raise gymnasium.error.ResetNeeded("an episode is one decision: call reset() before the next")
         (context, reward_of), self._round = self._round, None
-        return context.copy(), float(reward_of(int(action))), True, False, {"policy": self.policies[int(action)]}
+        return context.copy(), float(reward_of(index)), True, False, {"policy": self.policies[index]}
 
 
 def table_rounds(contexts: ArrayLike, rewards: ArrayLike, in_order: bool = False) -> Draw:

@@ -12,12 +12,16 @@ from osel_sim.selection.skills import Skills
 
 
 class KernelUCBSelector(BayesianSelector):
-    """Kernel UCB with what matters learned from the evidence: Gaussian-process regression of each policy's success on the context.
+    """Gaussian-process regression of every policy's success on the context, with what matters learned from the evidence.
 
     Contexts that lie together share what was learned of a policy, those apart do not, so regions of any shape can be told apart, and the selector
     begins as a bandit without context and becomes a contextual one as far as the rewards speak for it (see `BayesianSelector`). Where they
-    never do it stays with the best single policy. Declared costs spare it learning time and price, declared skills trying everything everywhere; it
-    works without, and with no context seen before.
+    never do it is Thompson sampling on the policies' means, and ends with the best single policy. Declared costs spare it learning time and price,
+    declared skills trying everything everywhere; it works without, and with no context seen before.
+
+    What a policy does in one context is explored by optimism, which wastes least where there are many contexts; what it does on the whole by chance,
+    as optimism never returns to a policy whose first tries were bad luck. Settings were chosen on made-up problems (`benchmarks/selection.py`, seeds
+    below 1000) and the choosing half of `assets/logs/suite`.
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
@@ -25,7 +29,7 @@ class KernelUCBSelector(BayesianSelector):
         skills: which policies declare what, as `episodes.declared_skills` gives it; a first guess, overruled by outcomes. None: nothing is known.
         warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
         components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
-        signals, optimism, chance: see `Prior`. A little chance keeps every propensity above 0 where policies are close.
+        signals, shared, optimism, chance, mean_chance, floor: see `Prior`.
 
     Raises:
         UsageError: a number out of range, or contexts (those of the skills, too) of another form.
@@ -47,14 +51,27 @@ class KernelUCBSelector(BayesianSelector):
         whitening: float = 0.25,
         width: float = 0.7,
         landmarks: int = 64,
-        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8, 2.0),
+        signals: Sequence[float] = (0.05, 0.3, 1.2),
+        shared: Sequence[float] = (0.0, 0.5),
         optimism: float = 1.0,
         chance: float = 0.1,
+        mean_chance: float = 0.7,
+        floor: float = 0.1,
     ) -> None:
         if components < 1 or landmarks < 1 or not width > 0.0:
             raise UsageError(f"components and landmarks must be at least 1 and width positive, got {components}, {landmarks}, {width}")
         self._own = {"components": components, "whitening": whitening, "width": width, "landmarks": landmarks}
-        prior = Prior(signals, optimism, chance, expected_costs, warm_contexts, skills)
+        prior = Prior(
+            signals,
+            shared,
+            optimism=optimism,
+            chance=chance,
+            mean_chance=mean_chance,
+            floor=floor,
+            expected_costs=expected_costs,
+            warm_contexts=warm_contexts,
+            skills=skills,
+        )
         super().__init__(policies, context_dim, seed, Landmarks(components, whitening, width, landmarks), prior)
 
     @property

@@ -36,7 +36,11 @@ class LinearSelector(BayesianSelector):
 
 
 class LinUCBSelector(LinearSelector):
-    """Chooses the policy whose reward is highest at `optimism` deviations above its mean (Li et al. 2010). Arguments: `LinearSelector`, `Prior`."""
+    """Chooses the policy whose reward is highest at `optimism` deviations above its mean (Li et al. 2010). Arguments: `LinearSelector`, `Prior`.
+
+    As published it can stay with a worse policy for good: where the first tries of the better one were bad luck its bound lies below the other's, and
+    no bound of a policy changes while it is not chosen. `auto` and `lints` choose by chance and come back.
+    """
 
     name: ClassVar[str] = "linucb"
 
@@ -48,17 +52,24 @@ class LinUCBSelector(LinearSelector):
         *,
         components: int = 24,
         optimism: float = 1.0,
-        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8),
+        signals: Sequence[float] = (0.05, 0.2, 0.8),
         expected_costs: Mapping[str, float] | None = None,
         warm_contexts: ArrayLike | None = None,
     ) -> None:
-        super().__init__(policies, context_dim, seed, components, Prior(signals, optimism, 0.0, expected_costs, warm_contexts))
+        super().__init__(
+            policies,
+            context_dim,
+            seed,
+            components,
+            Prior(signals, optimism=optimism, mean_optimism=optimism, expected_costs=expected_costs, warm_contexts=warm_contexts),
+        )
 
 
 class LinTSSelector(LinearSelector):
     """Chooses the policy whose reward is highest in a draw from what is believed (Agrawal and Goyal 2013). Arguments: `LinearSelector`, `Prior`.
 
-    `chance` scales the deviation of the draws. 1 is Thompson sampling proper, which explores more than some thousand decisions repay.
+    `chance` scales the deviation of the draws where it is the context's; that of a policy's mean is drawn from in full. 1 is Thompson sampling
+    proper, which explores more than some thousand decisions repay.
     """
 
     name: ClassVar[str] = "lints"
@@ -71,8 +82,14 @@ class LinTSSelector(LinearSelector):
         *,
         components: int = 24,
         chance: float = 0.5,
-        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8),
+        signals: Sequence[float] = (0.05, 0.2, 0.8),
         expected_costs: Mapping[str, float] | None = None,
         warm_contexts: ArrayLike | None = None,
     ) -> None:
-        super().__init__(policies, context_dim, seed, components, Prior(signals, 0.0, chance, expected_costs, warm_contexts))
+        super().__init__(
+            policies,
+            context_dim,
+            seed,
+            components,
+            Prior(signals, chance=chance, mean_chance=1.0, expected_costs=expected_costs, warm_contexts=warm_contexts),
+        )

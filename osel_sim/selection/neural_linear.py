@@ -43,7 +43,7 @@ class NeuralLinearSelector(BayesianSelector):
         components: int = 24,
         hidden: int = 32,
         chance: float = 0.5,
-        signals: Sequence[float] = (1e-6, 0.05, 0.2, 0.8),
+        signals: Sequence[float] = (0.05, 0.2, 0.8),
         expected_costs: Mapping[str, float] | None = None,
         warm_contexts: ArrayLike | None = None,
     ) -> None:
@@ -51,7 +51,7 @@ class NeuralLinearSelector(BayesianSelector):
             raise UsageError(f"components and hidden must be at least 1, got {components} and {hidden}")
         self._own = {"components": components, "hidden": hidden}
         self._hidden = HiddenLayer(components, hidden)
-        prior = Prior(signals, chance=chance, expected_costs=expected_costs, warm_contexts=warm_contexts)
+        prior = Prior(signals, chance=chance, mean_chance=chance, expected_costs=expected_costs, warm_contexts=warm_contexts)
         super().__init__(policies, context_dim, seed, self._hidden, prior)
 
     @property
@@ -90,7 +90,7 @@ class HiddenLayer:
         """Least squares on the chosen policy's reward, by AdamW.
 
         Args:
-            contexts: (n, sketched dim). chosen: (n,) columns. targets: (n,) rewards + costs. policies: number of outputs.
+            contexts: (n, sketched dim). chosen: (n,) columns. targets: (n,) rewards + costs, standardised. policies: number of outputs.
         """
         import torch
 

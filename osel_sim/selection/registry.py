@@ -2,11 +2,13 @@
 
 import inspect
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.registry import Registry
-from osel_sim.interface.selector import Selector
+
+if TYPE_CHECKING:  # imports numpy
+    from osel_sim.interface.selector import Selector
 
 ENTRY_POINTS = "osel_sim.selectors"
 """Entry-point group in which other packages offer selectors: `name = "module:Class"`."""
@@ -28,6 +30,28 @@ BUILT_IN = {
     "vw_squarecb": "osel_sim.selection.vowpal:SquareCBSelector",
 }
 
+RECOMMENDED = "auto"
+"""The selector that we recommend. The default of a live run is the paper's PPO."""
+RECOMMENDATION = f"The selector we recommend is {RECOMMENDED} (--selector {RECOMMENDED}), which learns from far fewer decisions than the paper's ppo"
+
+ABOUT = {
+    "auto": "kernel UCB: contextual as far as the rewards speak for it; the one we recommend",
+    "epsilon_greedy": "the paper's: best mean so far, exploring less and less",
+    "fixed": "fixed:POLICY, always the same one",
+    "kernel_ucb": "another name of auto",
+    "lints": "Thompson sampling on a linear model of the context",
+    "linucb": "highest upper bound of a linear model of the context",
+    "neural_linear": "Thompson sampling on the hidden layer of a small network",
+    "ppo": "the paper's, of stable-baselines3: contextual, and slow to learn; the default of run",
+    "ppo_tuned": "ppo with leading components of the context and a larger learning rate",
+    "random": "every policy equally often",
+    "thompson": "Thompson sampling on mean rewards, without context",
+    "ucb1": "highest upper bound of the mean rewards, without context",
+    "vw_regcb": "Vowpal Wabbit's RegCB (extra vw)",
+    "vw_squarecb": "Vowpal Wabbit's SquareCB (extra vw)",
+}
+"""A line about each of our own."""
+
 SELECTORS = Registry[Any]("selector", ENTRY_POINTS, BUILT_IN)
 
 
@@ -36,7 +60,12 @@ def selector_locations() -> dict[str, str]:
     return SELECTORS.locations()
 
 
-def make_selector(name: str, policies: Sequence[str], context_dim: int, seed: int, **settings: Any) -> Selector:
+def is_recommended(name: str) -> bool:
+    """Whether that is the selector that we recommend, by whichever of its names."""
+    return BUILT_IN.get(name) == BUILT_IN[RECOMMENDED]
+
+
+def make_selector(name: str, policies: Sequence[str], context_dim: int, seed: int, **settings: Any) -> "Selector":
     """Build a selector.
 
     Args:
@@ -63,7 +92,7 @@ def make_selector(name: str, policies: Sequence[str], context_dim: int, seed: in
     for setting in settings:
         if setting not in known:
             raise UnknownNameError(f"setting of selector {kind!r}", setting, known)
-    return cast(Selector, factory(policies, context_dim, seed, **settings))
+    return cast("Selector", factory(policies, context_dim, seed, **settings))
 
 
 def setting_names(name: str) -> list[str]:

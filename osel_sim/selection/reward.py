@@ -5,76 +5,26 @@ Everything here works on arrays, NaN standing for what is not known; a single ou
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, OselError, UsageError
 from osel_sim.formats.rollout_log import Row
-from osel_sim.interface.outcome import Outcome, credited
+from osel_sim.formats.toml_types import quoted
+from osel_sim.formats.values import AMOUNT, TEXT, fault
+from osel_sim.interface.outcome import Outcome, credited, stood_in
+from osel_sim.selection.weights import PRESETS as PRESETS
+from osel_sim.selection.weights import RewardWeights as RewardWeights
+from osel_sim.selection.weights import preset as preset
 
 Array = NDArray[np.float64]
-TimeUnit = Literal["log10-seconds", "steps"]
-Success = Literal["success", "subgoals", "score"]
 
 FLOOR_SECONDS = 0.05
 """One control step. Nothing here is quicker, and the logarithm of no time at all has no value."""
-
-
-@dataclass(frozen=True)
-class RewardWeights:
-    """What matters to the user, and how much.
-
-    Attributes:
-        alpha_time: weight of the time, >= 0.
-        alpha_price: weight of the price in cents, >= 0.
-        time_unit: time is the log10 of the total seconds, or the number of control steps.
-        success: S is 1 or 0 for the goal, the fraction of the subgoals reached, or the score of a log that has one (minus the action MSE).
-
-    Raises:
-        UsageError: a weight is negative or not finite.
-        UnknownNameError: no such time unit or kind of success.
-    """
-
-    alpha_time: float
-    alpha_price: float
-    time_unit: TimeUnit = "log10-seconds"
-    success: Success = "success"
-
-    def __post_init__(self) -> None:
-        for name in ("alpha_time", "alpha_price"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UsageError(f"{name} must be a finite number >= 0, got {value}")
-        if self.time_unit not in get_args(TimeUnit):
-            raise UnknownNameError("time unit", self.time_unit, get_args(TimeUnit))
-        if self.success not in get_args(Success):
-            raise UnknownNameError("kind of success", self.success, get_args(Success))
-
-
-PRESETS = {
-    "mmlu": RewardWeights(0.03, 0.0008),
-    "waymo": RewardWeights(0.2, 0.001),
-    "alfred": RewardWeights(0.05, 0.005, "steps", "subgoals"),
-    "oxe": RewardWeights(0.2, 0.01),
-}
-"""The paper's weights (appendix "Weights"). Time is log10 seconds, in ALFRED the robot's steps: there whole skills, some tens an episode, so that
-at 20 control steps a second its alpha_time weighs heavily. S of Open X-Embodiment is minus the action MSE in the paper, for want of an environment
-to try the actions in; here the task's success is known and takes its place. A log of `osel_sim.ingest --metric action-mse` has the paper's S as
-its score: `replace(preset("oxe"), success="score")`."""
-
-
-def preset(name: str) -> RewardWeights:
-    """Weights of one of the paper's workloads.
-
-    Raises:
-        UnknownNameError: no such preset.
-    """
-    if name not in PRESETS:
-        raise UnknownNameError("reward preset", name, PRESETS)
-    return PRESETS[name]
+FLOOR_STEPS = 1.0
+"""The same in steps."""
 
 
 def combined(weights: RewardWeights, score: ArrayLike, time: ArrayLike, price: ArrayLike) -> Array:
@@ -100,10 +50,11 @@ def charge(weights: RewardWeights, time: ArrayLike, price: ArrayLike) -> Array:
 
 
 def counted_time(weights: RewardWeights, steps: ArrayLike, seconds: ArrayLike) -> Array:
-    """Time as the reward counts it: control steps, or log10 of the total seconds."""
+    """Time as the reward counts it: log10 of the total seconds or of the control steps, or the control steps."""
     if weights.time_unit == "steps":
         return np.asarray(steps, np.float64)
-    floored = np.maximum(np.asarray(seconds, np.float64), FLOOR_SECONDS)
+    time, floor = (seconds, FLOOR_SECONDS) if weights.clock == "seconds" else (steps, FLOOR_STEPS)
+    floored = np.maximum(np.asarray(time, np.float64), floor)
     # numpy's vectorised logarithm and the C library's differ in the last bit (for 9% of times); journals hold the one, results of replays the other.
     return np.asarray(np.log10(floored) if floored.ndim else math.log10(floored), np.float64)
 
@@ -131,6 +82,45 @@ def reward(outcome: Outcome, weights: RewardWeights) -> float:
         raise UsageError("an episode has no score; S must be 'success' or 'subgoals'")
     time = counted_time(weights, outcome.steps, total_seconds(**vars(outcome.seconds)))
     return float(combined(weights, credited(outcome, weights.success), time, outcome.price))
+
+
+def check_reward(value: float | None, outcome: Outcome, weights: RewardWeights, place: str) -> None:
+    """Refuse a reward that was written down, and is not what its outcome comes to.
+
+    Args:
+        place: of both, such as file and line.
+
+    Raises:
+        DataError: naming the place, and the reward that would be right.
+    """
+    if stood_in(outcome) and outcome.fallback_steps is None:
+        return  # of an earlier version, which credited the policy with what its fallback did
+    right = None if outcome.error is not None else reward(outcome, weights)
+    # Another machine's logarithm may differ in the last bit.
+    if (value is None) != (right is None) or (value is not None and right is not None and not math.isclose(value, right, rel_tol=1e-9, abs_tol=1e-9)):
+        raise DataError(f"{place}: reward is {quoted(value)}, its outcome comes to {quoted(right)}")
+
+
+def weights_from(data: Any, place: str) -> RewardWeights:
+    """Weights that were written down as JSON.
+
+    Args:
+        place: where, for the error.
+
+    Raises:
+        DataError: they do not have the promised form.
+    """
+    if not isinstance(data, dict):
+        raise DataError(f"{place} must be an object of {', '.join(_JSON)}, got {quoted(data)}")
+    if problem := fault(data, _JSON):
+        raise DataError(f"{place}: {problem}")
+    try:
+        return RewardWeights(**data)
+    except OselError as error:
+        raise DataError(f"{place}: {error}") from None
+
+
+_JSON = {"alpha_time": AMOUNT, "alpha_price": AMOUNT, "time_unit": TEXT, "success": TEXT}
 
 
 def row_seconds(rows: Sequence[Row]) -> Array:

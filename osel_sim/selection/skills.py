@@ -13,9 +13,9 @@ from osel_sim.interface.selector import Context
 
 Array = NDArray[np.float64]
 
-DECLARED, NOT_DECLARED = 0.6, 0.1
-"""Success to expect of a policy where it declares the skill that is asked for, and where it does not. On the choosing half of `assets/logs/suite`
-0.5 to 0.7 and 0.05 to 0.2 came out alike."""
+DECLARED, NOT_DECLARED = 0.5, -0.5
+"""Reward + cost to expect of a policy where it declares the skill that is asked for, and where it does not: from the centre of all, in standard
+deviations of them."""
 UNKNOWN = 0.8
 """Of a policy that declares nothing: as if it declared four skills of five."""
 

@@ -34,6 +34,7 @@ class Control:
 
         from osel_sim.sim import osc
 
+        osc.prepare()
         self._mujoco, self._osc = mujoco, osc
         self._model, self._data = model, data
         self._initial_joint = np.array(initial_joint, dtype=np.float64)

@@ -1,5 +1,6 @@
 """A task as a `gymnasium.Env`, and the calls the episode loop needs beside `reset` and `step`."""
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -8,18 +9,22 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Observation
 from osel_sim.sim import predicates
+from osel_sim.sim.cameras import LARGEST
 from osel_sim.sim.instance import Instance, make_instance
 from osel_sim.sim.robots import with_robot
-from osel_sim.sim.specification import ACTION_DIM, CONTROL_HZ, STATE_DIM, specification
+from osel_sim.sim.specification import ACTION, ACTION_DIM, CONTROL_HZ, STATE_DIM, specification
 from osel_sim.sim.world import Snapshot, World
 
 if TYPE_CHECKING:
     from osel_sim.sim.expert import Expert
 
+OPTIONS = ("instance", "seed", "level", "split", "axes")
+"""What `reset` takes as options."""
 WAITING = 0.0
 """A gripper command of 0 leaves the fingers as they are (only the sign counts)."""
 
@@ -43,6 +48,10 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         image_size: pixels, square.
         render_mode: `rgb_array` or None.
         robot: name of the robot; None: the task's own.
+
+    Raises:
+        UsageError: an unknown camera or way of rendering, or an image size out of range.
+        OselError: the task, split, level, an axis or the robot is not known; names the nearest.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012 (gymnasium's own declaration)
@@ -69,13 +78,21 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         from osel_sim.sim.cameras import Cameras
 
         task = with_robot([task], robot)[0]
+        self.instance: Instance = make_instance(task, 0, level, split, axes)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise UnknownNameError("render mode", str(render_mode), self.metadata["render_modes"])
+        if not isinstance(image_size, int | np.integer) or not 1 <= image_size <= LARGEST:
+            raise UsageError(f"image_size must be an integer in [1, {LARGEST}], got {image_size!r}")
         self.task = task
         self.split, self.level, self.axes = split, level, dict(axes or {})
-        self.cameras, self.image_size = tuple(cameras), image_size
+        self.cameras, self.image_size = (cameras,) if isinstance(cameras, str) else tuple(cameras), int(image_size)
         self.render_mode = render_mode
         self.world = World(task)
+        there = [*self.world.scene.cameras, *(self.world.model.camera(index).name for index in range(self.world.model.ncam))]
+        for camera in self.cameras:
+            if camera not in there:
+                raise UnknownNameError("camera", str(camera), there)
         self._images = Cameras(self.world.model, self.world.scene.xml, self.world.appearance)
-        self.instance: Instance = make_instance(task, 0, level, split, axes)
         self.world.load(self.instance)
         self.steps, self._reached = 0, 0
         spaces: dict[str, gymnasium.Space[Any]] = {"observation.state": gymnasium.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)}
@@ -87,17 +104,27 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
     # -- gymnasium -----------------------------------------------------------------------------------------------------
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-        """Load a random instance, or `options={"instance": Instance}`."""
+        """Load an instance.
+
+        Args:
+            seed: of the random numbers that instances are drawn by, as gymnasium has it.
+            options: for this episode. `instance`: that `Instance` of the task. Or any of `seed` (of the instance itself, as in its key; else it is
+                drawn), `level`, `split` and `axes`, each in place of the environment's own.
+
+        Raises:
+            UsageError: an unknown option, or a value that none can have.
+        """
         super().reset(seed=seed)
-        instance = (options or {}).get("instance")
-        if instance is None:
-            instance = make_instance(self.task, int(self.np_random.integers(2**31)), self.level, self.split, self.axes)
-        self.load(instance)
+        self.load(self._chosen(options or {}))
         return self._gym_observation(), self._info()
 
     def step(self, action: NDArray[Any]) -> tuple[dict[str, NDArray[Any]], float, bool, bool, dict[str, Any]]:
-        """One control step; ends with success, or at the horizon."""
-        self.advance(action)
+        """One control step; ends with success, or at the horizon. Actions beyond [-1, 1] are clipped.
+
+        Raises:
+            UsageError: not 7 finite real numbers.
+        """
+        self.advance(self._checked(action))
         success = self.success
         return self._gym_observation(), float(success), success, not success and self.steps >= self.task.horizon, self._info()
 
@@ -189,6 +216,38 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
 
     # -- inside --------------------------------------------------------------------------------------------------------
 
+    def _chosen(self, options: Mapping[str, Any]) -> Instance:
+        """The instance that `reset` is asked for."""
+        for name in options:
+            if name not in OPTIONS:
+                raise UnknownNameError("option of reset", str(name), OPTIONS)
+        instance = options.get("instance")
+        if instance is not None:
+            if others := [name for name in options if name != "instance"]:
+                raise UsageError(f"options: an instance has its own {', '.join(others)}; give one or the other")
+            if not isinstance(instance, Instance) or (instance.task, instance.robot) != (self.task.name, self.task.robot):
+                raise UsageError(f"options: instance must be one of {self.task.name!r} with {self.task.robot}, as make_instance makes it")
+            return instance
+        seed = options.get("seed")
+        number = int(self.np_random.integers(2**31)) if seed is None else _integer("seed", seed)
+        level = _integer("level", options.get("level", self.level))
+        axes = options.get("axes", self.axes)
+        if not isinstance(axes, Mapping):
+            raise UsageError(f"options: axes must be a mapping from axis to level, got {axes!r}")
+        return make_instance(self.task, number, level, options.get("split", self.split), axes)
+
+    def _checked(self, action: Any) -> NDArray[np.float64]:
+        """An action of a user as numbers within the bounds."""
+        try:
+            values = np.asarray(action)
+        except ValueError:  # ragged lists
+            values = np.empty(0, object)
+        if values.dtype.kind not in "fiu" or values.shape != (ACTION_DIM,):
+            raise UsageError(f"an action must be {ACTION_DIM} real numbers of shape ({ACTION_DIM},), got {values.dtype} of shape {values.shape}")
+        if not np.isfinite(values).all():
+            raise UsageError(f"an action must be finite numbers, got {values.tolist()}")
+        return np.clip(values.astype(np.float64), ACTION.low, ACTION.high)
+
     def _advance_subgoals(self) -> None:
         subgoals = self.task.subgoals
         while self._reached < len(subgoals) and predicates.holds(self.world, subgoals[self._reached][1]):
@@ -208,3 +267,13 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
 
     def _info(self) -> dict[str, Any]:
         return {"instruction": self.instance.instruction, "instance": self.instance.key, "success": self.success, "subgoals": self.subgoal_fraction}
+
+
+def _integer(name: str, value: Any) -> int:
+    try:
+        number = None if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = None
+    if number is None:
+        raise UsageError(f"options: {name} must be an integer, got {value!r}")
+    return number

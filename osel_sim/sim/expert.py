@@ -44,15 +44,23 @@ class Expert:
     """Drives a world's loaded instance through its task's plan.
 
     Usage: `reset()` after each `World.load`, then `world.step(expert.act())` until the goal holds.
+
+    Attributes:
+        finished: it came to the end of the plan; it looks from there on for what has been undone.
     """
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self._stage = 0
+        self._stage, self.finished = 0, False
 
     def reset(self) -> None:
         """Begin the plan anew."""
-        self._stage = 0
+        self._stage, self.finished = 0, False
+
+    @property
+    def stage(self) -> int:
+        """Which step of the plan it is at, from 0; the plan's length where all is done."""
+        return self._stage
 
     @property
     def focus(self) -> tuple[str, str]:
@@ -68,6 +76,7 @@ class Expert:
         for _ in range(2 * len(plan)):
             if self._stage == len(plan):
                 self._stage = 0  # all done, unless something has been undone meanwhile
+                self.finished = True
             if (after := self._achieved()) is not None:
                 self._stage = after
                 continue

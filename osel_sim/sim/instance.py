@@ -216,7 +216,9 @@ def _draw_entities(task: TaskSpec, rng: np.random.Generator) -> list[Entity]:
     objects = task.of_kind("object")
     low, high = task.distractors
     count = [*task.roles.values(), *task.unnamed.values()].count("object") + int(rng.integers(low, high + 1))
-    chosen = sorted(rng.permutation(len(objects))[: min(count, len(objects))])
+    fixed = [index for index, entity in enumerate(objects) if entity.name in task.fixed.values()]
+    drawn = [index for index in rng.permutation(len(objects)) if index not in fixed]
+    chosen = sorted([*fixed, *drawn][:count])
     return [objects[index] for index in chosen] + [entity for entity in task.entities if entity.kind != "object"]
 
 
@@ -224,11 +226,14 @@ def _draw_roles(task: TaskSpec, present: list[Entity], rng: np.random.Generator)
     """Role -> name; None where a role is an attribute and none splits the things it is to sort."""
     roles: dict[str, str] = {}
     for role, kind in (*task.roles.items(), *task.unnamed.items()):
-        free = [entity.name for entity in present if entity.kind == kind and entity.name not in roles.values()]
+        taken = {*roles.values(), *task.fixed.values()} - {task.fixed.get(role)}
+        free = [entity.name for entity in present if entity.kind == kind and entity.name not in taken]
         if kind == ATTRIBUTE:
             free = [name for name in task.attributes if len({name in entity.attributes for entity in present if entity.kind == "object"}) == 2]
-            if not free:
-                return None
+        if role in task.fixed:
+            free = [name for name in free if name == task.fixed[role]]
+        if not free:
+            return None
         roles[role] = _pick(free, rng)
     for role, rule in task.sorted_roles.items():
         roles[role] = roles[rule.then if roles[rule.attribute] in task.entity(roles[rule.thing]).attributes else rule.otherwise]

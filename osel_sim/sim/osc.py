@@ -6,12 +6,26 @@ three pseudo-inverses a substep; all of them are of symmetric positive definite 
 of the time (Khatib 1987 for the method).
 """
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.core.compiled import njit
+from osel_sim.core.compiling import announced
 
 Array = NDArray[np.float64]
+
+
+@functools.cache
+def prepare() -> None:
+    """Compile all of this, or load it from numba's cache, before anything waits for it."""
+    joints, speeds = 7, 9
+    pose, jacobian, numbers = (np.zeros(3), np.eye(3).ravel()), np.zeros((3, speeds)), np.zeros(speeds)
+    inertia, addresses = np.eye(1, speeds)[0], 1 - np.eye(joints, dtype=np.int32)  # a mass matrix of ones on its diagonal
+    with announced("the control of the arm"):
+        goal = goal_pose(np.zeros(6), np.ones(6), np.zeros(3), np.eye(3), np.eye(3))
+        osc_torques(*goal, *pose, jacobian, jacobian, inertia, addresses, numbers, numbers, numbers, np.zeros(joints), (1.0, 1.0, 1.0, 1.0))
 
 
 @njit(cache=True)

@@ -82,6 +82,12 @@ class OurSuite:
 
         return make_instance(self.tasks.spec(task), seed, level, split, axes)
 
+    def prepare(self) -> None:
+        """Compile the control of the arm."""
+        from osel_sim.sim.osc import prepare
+
+        prepare()
+
     def open(self, task: str) -> "TaskEnv":
         """Make the environment of a task; takes seconds."""
         from osel_sim.sim.env import TaskEnv

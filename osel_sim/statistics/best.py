@@ -10,19 +10,19 @@ Array = NDArray[np.float64]
 TIE = 1e-9
 """Values that differ by no more are equal: the same reward comes out differently in the last bits when it is a mean of other repeats."""
 
-NODES = 512
-"""Points of each distribution, of equal probability, at which the others are evaluated.
+QUANTILES = 32
+"""Points of each distribution that the grid begins from, of equal probability between them; three more reach into each tail."""
 
-Gauss-Hermite quadrature with 32 points takes a seventh of the time, but errs by up to 0.07 where one deviation is a hundred times another, whose
-whole distribution then falls between two points.
-"""
+GRID = 640
+"""Most points of the grid: those of 16 quantities. Of more quantities evenly spaced ones are kept."""
 
 
 def probability_of_best(means: Array, deviations: Array) -> Array:
-    """Probability of each of several independent Gaussian quantities to be the highest, (P,), to 0.001; they sum to 1.
+    """Probability of each of several independent Gaussian quantities to be the highest, (P,), to some thousandths; they sum to 1.
 
-    Integrated numerically over each one's own distribution. As the propensities of a choice that is drawn from them they are exact, whatever the
-    error of the integral.
+    A quantity is the highest where it lies in a cell of a grid and all others lie below. The grid is made of quantiles of all of them, so that the
+    cells are narrow wherever one of the distributions is, whatever the others' widths. As the propensities of a choice that is drawn from them
+    they are exact, whatever the error of the integral.
 
     Args:
         means: (P,).
@@ -35,11 +35,16 @@ def probability_of_best(means: Array, deviations: Array) -> Array:
         return np.asarray(best / best.sum(), np.float64)
     from scipy.special import ndtr
 
-    points = means[:, None] + deviations[:, None] * _quantiles()  # (P, NODES)
-    below = ndtr((points[:, None, :] - means[None, :, None]) / deviations[None, :, None])  # (P, P, NODES): at a point of one, the other is below it
-    own = np.arange(len(means))
-    below[own, own] = 1.0
-    probabilities = below.prod(axis=1).mean(axis=1)
+    points = (means[:, None] + deviations[:, None] * _quantiles()).ravel()
+    points = np.sort(points[points >= (means - _REACH * deviations).max()])  # the highest of all lies below that with next to no probability
+    if len(points) > GRID:
+        points = points[np.linspace(0, len(points) - 1, GRID).astype(np.int64)]
+    below = ndtr((points - means[:, None]) / deviations[:, None])  # (P, points)
+    logarithms = np.log(np.maximum(below, 1e-300))
+    others = np.exp(logarithms.sum(axis=0) - logarithms)  # all others lie below the point
+    within = np.diff(below, axis=1, prepend=0.0, append=1.0)
+    edges = np.concatenate([np.zeros((len(means), 1)), others, np.ones((len(means), 1))], axis=1)
+    probabilities = (within * (edges[:, 1:] + edges[:, :-1])).sum(axis=1)
     return np.asarray(probabilities / probabilities.sum(), np.float64)
 
 
@@ -60,9 +65,14 @@ def share_of_best(values: ArrayLike) -> Array:
     return np.asarray((best / best.sum(axis=1, keepdims=True)).mean(axis=0) if len(best) else np.full(best.shape[1], np.nan), np.float64)
 
 
+_TAILS = (3.5, 4.5, 6.0)
+_REACH = 5.0
+
+
 @cache
 def _quantiles() -> Array:
-    """The middles of `NODES` slices of equal probability of a standard normal distribution."""
+    """Where the grid begins from, in deviations from the mean."""
     from scipy.special import ndtri
 
-    return np.asarray(ndtri((np.arange(NODES) + 0.5) / NODES), np.float64)
+    middles = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
+    return np.concatenate([-np.array(_TAILS[::-1]), middles, _TAILS])

@@ -3,7 +3,7 @@
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,8 @@ from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.training.annotations import SIDE_FILE
 from osel_sim.training.demonstrations import Shard, record_shard, side_file
+
+logger = logging.getLogger(__name__)
 
 SHARD = 20
 
@@ -45,8 +47,11 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     """Record all missing shards with `workers` processes, then join them into one dataset at `out`. Returns what was done, in words."""
     from osel_sim.core.progress import progress
     from osel_sim.sim.gl import choose_backend
+    from osel_sim.sim.osc import prepare
 
     choose_backend()
+    prepare()
+    logger.info("%s: starting %d workers ...", task.name, workers)
     _quiet_lerobot()
     shards = [
         Shard(task.file, shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes, task.robot)
@@ -56,7 +61,7 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     frames = 0
     failed: list[int] = []
     with progress(episodes, "episode", task.name) as bar:
-        for shard, shard_frames, shard_failed in _record_shards(shards, workers):
+        for shard, shard_frames, shard_failed in _record_shards(shards, workers, bar.begin):
             frames, failed = frames + shard_frames, failed + shard_failed
             bar.note(f"frames={frames}, failed={len(failed)}")
             bar.update(shard.episodes)
@@ -64,7 +69,7 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     return f"{out}: {episodes - len(failed)} demonstrations, {frames} frames; the expert failed on {len(failed)} of {episodes} seeds"
 
 
-def _record_shards(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shard, int, list[int]]]:
+def _record_shards(shards: Sequence[Shard], workers: int, ready: Callable[[], None]) -> Iterator[tuple[Shard, int, list[int]]]:
     """Record shards in worker processes, unless they are there already: each with its number of frames and the seeds that the expert failed on.
 
     Raises:
@@ -72,7 +77,7 @@ def _record_shards(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shar
         Exception: what a shard raised, such as OSError where the disk is full.
     """
     lost: list[Lost[Shard]] = []
-    with closing(run_jobs(_recorder, shards, workers)) as events:
+    with closing(run_jobs(_recorder, shards, workers, ready=ready)) as events:
         for event in events:
             if isinstance(event, Lost):
                 if event.error is not None:

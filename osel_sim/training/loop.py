@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from osel_sim.core.errors import CheckpointError, DataError
+from osel_sim.core.errors import CheckpointError, DataError, DivergedError
 from osel_sim.core.progress import progress
 from osel_sim.core.torch_settings import computes_bfloat16
 from osel_sim.training.state import (
@@ -138,13 +138,20 @@ class Trainer:
             every: number of steps -> what to call after so many, with the step; also called after the last.
             save_every: steps between two saved states.
             until: stop here instead, with the state saved and the schedule that of `steps`.
+
+        Raises:
+            DivergedError: loss or gradient is not finite. Weights and average stay as the last good step left them, and are saved.
         """
         last = min(self.steps, until or self.steps)
         self._problem.module.train()
         with progress(self.steps, "step", label, initial=self.progress.step) as bar:
             for step, batch in self._prefetched(self.progress.step, last):
                 begin = time.perf_counter()
-                report = self._step(step, batch)
+                try:
+                    report = self._step(step, batch)
+                except DivergedError:
+                    self.save()
+                    raise
                 for name, value in report.items():
                     self.progress.losses[name] = 0.98 * self.progress.losses.get(name, value) + 0.02 * value
                 self.progress.step = step + 1
@@ -178,10 +185,19 @@ class Trainer:
         for group, peak in zip(problem.optimiser.param_groups, self._peaks, strict=True):
             group["lr"] = peak * problem.rate(step, self.steps)
         torch.manual_seed(problem.seed * 1_000_003 + step)  # noise that a policy draws: of the step, so that a resumed run draws the same
+        buffers = [(buffer, buffer.clone()) for buffer in problem.module.buffers()]
         loss, report = self._loss(batch)
         torch.autograd.backward(loss)
-        if problem.clip > 0:
-            nn.utils.clip_grad_norm_(problem.clipped, problem.clip)
+        norm = nn.utils.clip_grad_norm_(problem.clipped, problem.clip if problem.clip > 0 else math.inf)
+        if not math.isfinite(loss.item()) or not math.isfinite(norm.item()):
+            for buffer, before in buffers:
+                buffer.copy_(before)
+            problem.optimiser.zero_grad()
+            numbers = ", ".join(f"{name} {value:g}" for name, value in report.items())
+            raise DivergedError(
+                f"step {step + 1} of {self.steps}: {numbers}, size of the gradient {norm.item():g}: training cannot go on from what is no finite "
+                f"number; {self._folder} keeps the weights of step {step}. Look for damage in the data, or take a lower learning rate and begin anew"
+            )
         problem.optimiser.step()
         problem.optimiser.zero_grad()
         if problem.ema_decay is not None:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from osel_sim.core.errors import UsageError
 from osel_sim.core.files import atomic_files
+from osel_sim.formats.dataset_mapping import IMAGES
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.policy import register
 from osel_sim.policy.language_chunk import LanguageChunkConfig
@@ -24,7 +25,7 @@ from osel_sim.policy.scene import LABELS
 from osel_sim.sim.specification import ACTION_DIM, STATE_DIM
 from osel_sim.training.act import LabelWeights, PerceivingACT
 from osel_sim.training.batches import Statistics
-from osel_sim.training.dataset import IMAGES, Demonstrations
+from osel_sim.training.dataset import Demonstrations
 from osel_sim.training.recipe import Recipe
 from osel_sim.training.source import Wanted
 

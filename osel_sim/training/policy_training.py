@@ -14,7 +14,7 @@ import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import nn
 
-from osel_sim.core.errors import DataError, UsageError
+from osel_sim.core.errors import DataError, DivergedError, UsageError
 from osel_sim.core.files import finite, write_json
 from osel_sim.core.shown import shown
 from osel_sim.core.torch_settings import computes_bfloat16
@@ -41,6 +41,7 @@ class Options:
         until: stop after so many steps, as if interrupted there.
         tasks: folder with the user's own task files, for rollouts.
         init: checkpoint folder whose weights, and what it normalises by, training begins with; None: fresh weights.
+        mapping: file of the datasets' own names and conventions; None: they have ours.
     """
 
     out: Path
@@ -55,6 +56,7 @@ class Options:
     until: int | None = None
     tasks: Path | None = None
     init: Path | None = None
+    mapping: Path | None = None
 
 
 def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Options) -> dict[str, Any]:
@@ -67,6 +69,7 @@ def train(spec: PolicySpec, recipe: Recipe, folders: Sequence[Path], options: Op
         DataError: a dataset does not fit, or an earlier state is damaged.
         UsageError: `out` is in use and `resume` was not asked for.
         CheckpointError: `init` is no checkpoint, or one of another model; or an earlier state is of other data, another seed or recipe.
+        DivergedError: the loss is no finite number any more; `out` keeps the last good weights.
     """
     if not options.resume and options.out.exists() and any(options.out.iterdir()):
         raise UsageError(f"{options.out} is not empty: continue it with --resume, or give another --out")
@@ -85,7 +88,7 @@ class PolicyTraining:
         self._spec, self._recipe, self._options = spec, recipe, options
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._initial = Initial(options.init) if options.init is not None else None
-        data = load_datasets(folders, spec, recipe)
+        data = load_datasets(folders, spec, recipe, options.mapping)
         self._parts = [split(one, recipe) for one in data]
         frames = [part.frames for part in self._parts]
         statistics = {**statistics_of(data, frames), **(self._initial.statistics if self._initial is not None else {})}
@@ -130,7 +133,12 @@ class PolicyTraining:
             + (f", continued at {trainer.progress.step}" if resumed else ""),
             file=sys.stderr,
         )
-        trainer.run({options.evaluate_every: self._evaluate}, save_every=options.save_every, label=self._spec.name, until=options.until)
+        try:
+            trainer.run({options.evaluate_every: self._evaluate}, save_every=options.save_every, label=self._spec.name, until=options.until)
+        except DivergedError:
+            if trainer.progress.step:
+                self._save_average()
+            raise
         return self._record(trainer.progress.step)
 
     def _identity(self) -> dict[str, Any]:
@@ -146,13 +154,12 @@ class PolicyTraining:
     def _evaluate(self, step: int) -> None:
         """Save the averaged weights as a checkpoint, with their errors on held-out episodes and the success of rollouts."""
         options, data = self._options, [part.data for part in self._parts]
-        self._average.load_state_dict(self._trainer.average)
+        self._save_average()
         by_task: dict[str, dict[str, float]] = {one.name: {} for one in data}
         for index, part in enumerate(self._parts):
             if len(part.held):
                 roles = list(part.data.annotations.roles) if part.data.annotations is not None else []
                 by_task[part.data.name] |= validate(self._average, self._held, index, len(part.held), roles)
-        self._model.save(self._average, options.out, half=options.half)
         if options.rollouts:
             from osel_sim.training.rollouts import success_rate
 
@@ -163,6 +170,11 @@ class PolicyTraining:
             print(f"{shown(task)}: " + "  ".join(f"{name} {value:.4g}" for name, value in result.items()), file=sys.stderr)
         self._validations.append({"step": step, **(next(iter(by_task.values())) if len(data) == 1 else {"tasks": by_task, **_means(by_task)})})
         write_json(options.out / "training.json", finite(self._record(step)))
+
+    def _save_average(self) -> None:
+        """Write the averaged weights as a checkpoint."""
+        self._average.load_state_dict(self._trainer.average)
+        self._model.save(self._average, self._options.out, half=self._options.half)
 
     def _record(self, step: int) -> dict[str, Any]:
         """What `training.json` holds after so many steps."""

@@ -10,10 +10,11 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from numpy.typing import NDArray
 from torch import Tensor
 
+from osel_sim.formats.dataset_mapping import IMAGES
 from osel_sim.policy.scene import ACTIVE_PLACES, ACTIVE_POSITIONS, GROUNDING_PLACES, GROUNDING_POSITIONS, GROUNDING_TOKENS, IMAGE_SHIFT
 from osel_sim.policy.text import tokenise
 from osel_sim.training.annotations import Annotations
-from osel_sim.training.dataset import IMAGES, Demonstrations
+from osel_sim.training.dataset import Demonstrations
 from osel_sim.training.instructions import Instructions
 from osel_sim.training.recipe import Augmentation
 

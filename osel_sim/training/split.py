@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 
 from osel_sim.core import content
 from osel_sim.core.errors import DataError, UnknownNameError
+from osel_sim.formats.dataset_mapping import load_dataset_mapping
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.ingestion.lerobot_numbers import check_mapping
 from osel_sim.training.batches import frames_of
 from osel_sim.training.dataset import Demonstrations, dataset_folders, load_demonstrations, task_of
 from osel_sim.training.recipe import Recipe
@@ -48,10 +50,14 @@ def split(data: Demonstrations, recipe: Recipe) -> Part:
     return Part(data, len(training), frames_of(data, training), frames_of(data, np.arange(available, data.episodes)))
 
 
-def load_datasets(folders: Sequence[Path], spec: PolicySpec, recipe: Recipe) -> list[Demonstrations]:
+def load_datasets(folders: Sequence[Path], spec: PolicySpec, recipe: Recipe, mapping: Path | None = None) -> list[Demonstrations]:
     """The datasets of the recipe's tasks among those given.
 
+    Args:
+        mapping: file of the datasets' own names and conventions.
+
     Raises:
+        ContentError: the mapping file is wrong.
         DataError: one cannot be read, two are of one task, one that the recipe wants is missing, or only some are annotated.
         UnknownNameError: the recipe weighs a task that there is not.
     """
@@ -64,7 +70,10 @@ def load_datasets(folders: Sequence[Path], spec: PolicySpec, recipe: Recipe) -> 
     for task in recipe.tasks or ():
         if task not in found:
             raise DataError(f"{recipe.file}: wants demonstrations of {task!r}, there are those of: {', '.join(sorted(found))}")
-    data = [load_demonstrations(folder, spec.cameras) for task, folder in found.items() if recipe.tasks is None or task in recipe.tasks]
+    wanted = [folder for task, folder in found.items() if recipe.tasks is None or task in recipe.tasks]
+    conventions = load_dataset_mapping(mapping)
+    check_mapping(conventions, mapping, spec.cameras)
+    data = [load_demonstrations(folder, spec.cameras, mapping=conventions) for folder in wanted]
     labelled = {one.name: one.annotations is not None for one in data}
     located = {one.name: one.annotations is not None and all(one.annotations.sees(camera) for camera in spec.cameras) for one in data}
     for known, what in ((labelled, "annotations"), (located, "known places in the images")):

@@ -6,10 +6,13 @@ draws of the choices are SB3's, from the same seed. Sums are formed in another o
 where a draw falls within that rounding of the border between two policies, and from there on the two go separate ways, each as good as the other.
 """
 
+import functools
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+
+from osel_sim.core.compiling import announced
 
 if TYPE_CHECKING:
     from osel_sim.selection.ppo.sb3 import PPOSelector
@@ -17,6 +20,22 @@ if TYPE_CHECKING:
 
 LINE = 16
 """Numbers in a cache line of 64 bytes."""
+
+
+@functools.cache
+def prepare() -> None:
+    """Compile what training takes, or load it from numba's cache, before anything waits for it."""
+    from osel_sim.selection.ppo.kernel import forward, log_softmax, train
+
+    sizes, batch = np.array([1, 2, 2], np.int64), 1
+    actor, critic = ((*(_aligned((10,)) for _ in range(3)), sizes) for _ in range(2))
+    work = [_aligned((2, batch, 2)) for _ in range(6)]
+    contexts, numbers, actions = _aligned((batch, 1)), np.zeros(batch, np.float32), np.zeros(batch, np.int64)
+    with announced("the training of ppo"):
+        forward(actor[0], actor[3], contexts, work[0])
+        log_softmax(work[0][-1], np.zeros((batch, 2)))
+        room, settings = _aligned((LINE,)), (1e-3, 1.0, 0.2, 0.0, 0.5, 0.5, -1.0)
+        train(actor, critic, np.zeros(1, np.int64), contexts, actions, numbers, numbers, numbers, contexts, (*work, room), settings)
 
 
 def supports(selector: "PPOSelector") -> bool:
@@ -51,7 +70,7 @@ class FastPPO:
         self.critic = _tower(state, "value_net", "value_net")
         self.steps = np.zeros(1, np.int64)
 
-    def run(self, contexts: NDArray[np.float32], rewards: NDArray[np.float64]) -> NDArray[np.int8]:
+    def run(self, contexts: NDArray[np.float32], rewards: NDArray[np.float64]) -> NDArray[np.int16]:
         """Go through a stream.
 
         Args:
@@ -63,8 +82,9 @@ class FastPPO:
         """
         from osel_sim.selection.ppo.kernel import BLOCK, forward, log_softmax, train
 
+        prepare()
         total, policies, size = len(contexts), rewards.shape[1], self._n_steps
-        chosen = np.zeros(total, np.int8)
+        chosen = np.zeros(total, np.int16)
         widest = int(max(self.actor[3][1:]))
 
         def buffers(tower: "Tower") -> list[NDArray[np.float32]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.context.encoder import encode_many, load_encoder
-from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER
+from osel_sim.context.names import DEFAULT_ENCODER
 from osel_sim.core.content import find
 from osel_sim.core.errors import OselError
 

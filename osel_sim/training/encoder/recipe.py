@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.context.open_clip_encoder import CONFIG, VOCABULARY
+from osel_sim.context.names import CONFIG
+from osel_sim.context.open_clip_encoder import VOCABULARY
 from osel_sim.training.encoder.captions import Captions, truth
 from osel_sim.training.encoder.scenes import Scenes
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.context.open_clip_encoder import DEFAULT_ENCODER, VOCABULARY, WEIGHTS
+from osel_sim.context.names import DEFAULT_ENCODER
+from osel_sim.context.open_clip_encoder import VOCABULARY, WEIGHTS
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.files import atomic, finite, write_json
 from osel_sim.formats.levels import LEVELS
