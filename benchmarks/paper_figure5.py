@@ -1,6 +1,6 @@
 """The paper's figure 5 again, over 20 seeds: does PPO pass the best single policy, after how many decisions, and on how many seeds?
 
-    python benchmarks/paper_figure5.py --out runs/paper_figure5 [--mmlu FOLDER] [--actions LOG] [--seeds 20] [--decisions 2500] [--form text images ...]
+    python benchmarks/paper_figure5.py [--out runs/paper_figure5] [--mmlu FOLDER] [--actions LOG] [--seeds 20] [--decisions 2500] [--form text images]
 
 Four forms of data, each without and with time and price in the reward:
   text     MMLU answered by two language models (--mmlu: the folder with mmlu_SUBJECT.csv, see examples/mmlu.toml), else a made table of that form
@@ -33,7 +33,7 @@ from osel_sim.selection.ppo.sb3 import PPOSelector
 from osel_sim.selection.reward import RewardWeights
 
 ASSETS = Path(__file__).resolve().parent.parent / "assets" / "logs"
-PPO, GREEDY, SINGLE, WORST = "PaperPPO", "epsilon_greedy", "best_single", "worst_single"
+PPO, GREEDY, SINGLE, WORST = "paper_ppo", "epsilon_greedy", "best_single", "worst_single"
 SHOWN = {"hindsight": "oracle (hindsight)", PPO: "PPO", GREEDY: "epsilon-greedy", SINGLE: "best single policy", WORST: "worst single policy"}
 CLIP_LENGTH = 10.0
 
@@ -108,6 +108,7 @@ def main() -> None:
     parser.add_argument("--form", nargs="+", choices=FORMS, default=list(FORMS), help="which of the four (default: all)")
     options = parser.parse_args()
 
+    (options.out / "made").mkdir(parents=True, exist_ok=True)
     panels, rows = [], []
     for name in options.form:
         form = FORMS[name]
@@ -142,6 +143,8 @@ def as_the_authors(contexts: np.ndarray, standardised: bool) -> type[PPOSelector
     scale = 1.0 / np.maximum(contexts.std(axis=0), 1e-6) if standardised else np.full(contexts.shape[1], CLIP_LENGTH, np.float32)
 
     class PaperPPO(PPOSelector):
+        name = PPO
+
         def __init__(self, policies, context_dim, seed):
             super().__init__(policies, context_dim, seed, activation="gelu", n_steps=5, batch_size=5, gamma=0.0)
 
@@ -244,7 +247,6 @@ def text_log(options: argparse.Namespace) -> Path:
 def actions_log(options: argparse.Namespace) -> Path:
     folder = options.actions or options.out / "logs" / "actions"
     if not (folder / "rollouts.parquet").is_file():
-        (options.out / "made").mkdir(parents=True, exist_ok=True)
         (options.out / "actions.toml").write_text(ACTIONS)
         osel.ingest(map=options.out / "actions.toml", files=[str(made_actions(options.out / "made").resolve())], out=folder)
     return folder
@@ -252,7 +254,6 @@ def actions_log(options: argparse.Namespace) -> Path:
 
 def made_questions(folder: Path, questions: int = 100) -> Path:
     """57 subjects with words of their own; in each the two models are right at rates of its own, .68 and .81 on average, as in the real table."""
-    folder.mkdir(parents=True, exist_ok=True)
     generator = np.random.default_rng(0)
     for subject in range(57):
         rates = np.clip(generator.normal((0.68, 0.81), (0.16, 0.12)), 0.05, 0.98)
