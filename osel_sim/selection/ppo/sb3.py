@@ -47,7 +47,7 @@ class PPOSelector(SelectorBase):
         max_grad_norm: gradients are clipped to this norm.
         target_kl: a training step ends when the policy has moved 1.5 times this far; None never ends it.
         layers: hidden layers of the policy network and of the value network, which share nothing.
-        activation: function between layers, `tanh` as by SB3's default or `gelu` as in the code of the paper's authors (`benchmarks/paper_figure5.py`).
+        activation: between layers: `tanh`, SB3's default, or `gelu`, as in the code of the paper's authors (`benchmarks/paper_figure5.py`).
 
     Raises:
         UsageError: a number out of range.
