@@ -110,7 +110,7 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
         tried = {name: np.concatenate([_received(means, router, *part) for part in parts]) for name, router in found.items()}
         best = max(tried, key=lambda name: float(tried[name].sum()))  # the first, which knows least, where several are equal
         ahead = tried[best] - tried[SINGLE]
-        used.append(best if ahead.sum() > ahead.std() * np.sqrt(len(ahead)) else SINGLE)
+        used.append(best if len(ahead) and ahead.sum() > ahead.std() * np.sqrt(len(ahead)) else SINGLE)
         return _received(means, found[used[-1]], by, on)
 
     with threadpool_limits(1):  # the last bits of a matrix product depend on the number of threads

@@ -97,7 +97,7 @@ def _features(contexts: NDArray[np.float32], labels: Sequence[Sequence[str]]) ->
     values = np.asarray(contexts, np.float64)
     values = values - values.mean(axis=0)
     scale = float(np.sqrt((values**2).sum(axis=1).mean()))
-    values = values / scale if scale > 0.0 else values
+    values = values / scale if scale > 0.0 else values[:, :1]
     if min(values.shape) > COMPONENTS:
         model = PCA(COMPONENTS, svd_solver="randomized", random_state=0).fit(values[_thinned(np.arange(len(values)))])
         values = model.transform(values)
