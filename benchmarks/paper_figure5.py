@@ -8,7 +8,7 @@ Four forms of data, each without and with time and price in the reward:
   steps    subgoals and steps: assets/logs/suite in place of ALFRED
   actions  action errors: a log of `python -m osel_sim.ingest --metric action-mse` (--actions), else a made table, in place of Open X-Embodiment
 Settings are those of the authors' code (docs/paper.md says which). What was replayed is kept in --out: the same command goes on where it was
-interrupted. It prints a Markdown table and writes `figure5.svg` and `.png`. 20 seeds of 2,500 decisions take half an hour on one core.
+interrupted. It prints a Markdown table and writes `figure5.svg` and `.png`. With 20 seeds a form takes some ten minutes on one core.
 """
 
 import argparse
