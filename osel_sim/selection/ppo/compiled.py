@@ -29,12 +29,13 @@ def prepare() -> None:
 
     sizes, batch = np.array([1, 2, 2], np.int64), 1
     actor, critic = ((*(_aligned((10,)) for _ in range(3)), sizes) for _ in range(2))
-    work = [_aligned((2, batch, 2)) for _ in range(6)]
+    layers = (2, batch, 2)
+    work = [_aligned(shape) for _ in range(2) for shape in ((2, *layers), (2, *layers), layers)]
     contexts, numbers, actions = _aligned((batch, 1)), np.zeros(batch, np.float32), np.zeros(batch, np.int64)
     with announced("the training of ppo"):
-        forward(actor[0], actor[3], contexts, work[0])
-        log_softmax(work[0][-1], np.zeros((batch, 2)))
-        room, settings = _aligned((LINE,)), (1e-3, 1.0, 0.2, 0.0, 0.5, 0.5, -1.0)
+        forward(actor[0], actor[3], contexts, work[0], False)
+        log_softmax(work[0][0, -1], np.zeros((batch, 2)))
+        room, settings = _aligned((LINE,)), (1e-3, 1.0, 0.2, 0.0, 0.5, 0.5, -1.0, 0.0)
         train(actor, critic, np.zeros(1, np.int64), contexts, actions, numbers, numbers, numbers, contexts, (*work, room), settings)
 
 
