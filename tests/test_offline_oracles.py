@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from synthetic_log import clusters, make_row, write_log
 
-from osel_sim.analysis.log import read_log
+from osel_sim.analysis.gains import Gain, gain_of
+from osel_sim.analysis.log import LoggedInstance, LoggedOutcomes, read_log
 from osel_sim.analysis.measures import Curves, gap_closed
 from osel_sim.analysis.oracles import expected_oracle, oracles
 from osel_sim.analysis.streams import complete_instances, draw_streams
@@ -29,7 +30,7 @@ def test_order_and_truth(tmp_path: Path):
     assert hindsight > made.oracle + 0.1
     assert made.best_single + 0.05 < found.expected.mean() < made.oracle + 0.02
     assert found.predictable.mean() == pytest.approx(made.oracle, abs=0.02)
-    assert found.grouping == {"first": ("target",), "second": ("target",)}
+    assert set(found.router) == {"first", "second"} and "one policy for all" not in found.router.values()
     assert oracles(log.take(log.half("score")), FREE).predictable.mean() == pytest.approx(made.oracle, abs=0.03)
     assert log.mean_rewards(FREE)[:, found.best_single].mean() == pytest.approx(made.best_single, abs=0.02)
 
@@ -67,7 +68,8 @@ def test_repeats_on_a_tenth_stand_for_all():
 
 def test_the_interval_of_the_gap_closed_counts_what_the_oracle_may_be_off():
     flat = np.zeros((5, 40))
-    sure = Curves({"x": flat + 0.5}, {"best_single": flat, "expected": flat + 1.0}, "expected", 30, np.zeros(RESAMPLES))
+    gains = {"expected": Gain(1.0, 0.1)}
+    sure = Curves({"x": flat + 0.5}, {"best_single": flat, "expected": flat + 1.0}, "expected", 30, np.zeros(RESAMPLES), gains, {})
     unsure = replace(sure, expected_errors=np.random.default_rng(0).normal(0.0, 0.1, RESAMPLES))
     assert gap_closed(sure.selectors["x"], sure, "expected", 0) == (0.5, (0.5, 0.5))
     share, (low, high) = gap_closed(unsure.selectors["x"], unsure, "expected", 0)
@@ -88,6 +90,60 @@ def test_groups_that_tell_nothing_are_not_used(tmp_path: Path):
     assert found.learnable == "predictable"
     best = log.mean_rewards(FREE)[:, 0].mean()
     assert best - 0.05 < found.predictable.mean() <= best + 1e-9
+
+
+TRUTHS = ("linear", "clusters", "either or", "groups", "texts")
+
+
+@pytest.mark.parametrize("truth", TRUTHS)
+def test_what_other_instances_tell_is_found(truth: str):
+    """One of two policies succeeds at .9 and the other at .2: which is which is in the context, in a label or in the text; best single: .55."""
+    generator = np.random.default_rng(5)
+    contexts = generator.normal(size=(1000, 8))
+    kind = generator.integers(20, size=1000)
+    first = {
+        "linear": contexts @ generator.normal(size=8) > 0.0,
+        "clusters": kind % 2 == 0,
+        "either or": (contexts[:, 0] > 0.0) != (contexts[:, 1] > 0.0),
+        "groups": kind % 2 == 0,
+        "texts": kind % 2 == 0,
+    }[truth]
+    if truth == "clusters":
+        contexts = contexts * 0.2 + generator.normal(size=(20, 8))[kind]
+    if truth == "either or":
+        contexts[:, 2:] *= 0.1
+    rates = np.where(first[:, None], (0.9, 0.2), (0.2, 0.9))
+    log = made(contexts, generator, rates, target=kind if truth == "groups" else None, instruction=kind if truth == "texts" else None)
+    found = oracles(log, FREE)
+    assert 0.55 + 0.2 < found.predictable.mean() < 0.9 + 0.02, found.router
+
+
+def test_what_tells_nothing_gains_nothing():
+    """Whatever the rates and the contexts' length: never beyond its error, and on average the best single policy's reward."""
+    apart, beyond = [], 0
+    for seed in range(20):
+        generator = np.random.default_rng(seed)
+        rates = np.tile(generator.uniform(0.3, 0.7, 3), (400, 1))
+        log = made(generator.normal(size=(400, (8, 64)[seed % 2])), generator, rates, target=generator.integers(9, size=400))
+        means = log.mean_rewards(FREE)
+        found = oracles(log, FREE)
+        gain = gain_of(np.arange(400, dtype=np.int32)[None], (found.predictable - means[:, found.best_single])[None])
+        apart.append(gain.mean)
+        beyond += gain.beyond_error()
+    assert beyond <= 1 and -0.015 < np.mean(apart) <= 0.005
+
+
+def made(contexts: np.ndarray, generator: np.random.Generator, rates: np.ndarray, **labels: np.ndarray | None) -> LoggedOutcomes:
+    """A log of successes at known rates (N, P); labels as texts."""
+    count, policies = rates.shape
+    success = (generator.random(rates.shape) < rates)[:, :, None].astype(float)
+    nothing = np.full(success.shape, np.nan)
+    told = {name: [f"{name} {value}" for value in values] for name, values in labels.items() if values is not None}
+    instances = tuple(LoggedInstance(f"i{row}", "made", **{name: values[row] for name, values in told.items()}) for row in range(count))
+    names = tuple(f"p{column}" for column in range(policies))
+    measures = dict.fromkeys(("subgoals", "score", "steps", "upload", "inference", "download", "motion", "price"), nothing)
+    context = contexts.astype(np.float32)
+    return LoggedOutcomes(Path("made"), instances, names, context, "made@1", success, **measures, errors=np.zeros(success.shape, bool), metadata={})
 
 
 def test_only_complete_instances_are_streamed(tmp_path: Path):

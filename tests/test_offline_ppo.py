@@ -49,6 +49,7 @@ CASES = {
     "paper, no limit on the divergence": ("ppo", 16, 60, {"target_kl": None, "layers": (32, 16)}),
     "unclipped gradients": ("ppo", 16, 60, {"max_grad_norm": 1e9, "layers": (32,), "ent_coef": 0.2}),
     "rollouts that are no multiple of five": ("ppo", 16, 100, {"n_steps": 13, "batch_size": 13, "layers": (32, 16), "learning_rate": 3e-3}),
+    "GELU, as in the code of the paper's authors": ("ppo", 16, 60, {"activation": "gelu", "layers": (64, 32)}),
     "tuned": ("ppo_tuned", 48, 200, {}),
 }
 

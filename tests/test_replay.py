@@ -12,15 +12,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from synthetic_log import clusters, make_row, write_log
 
 from osel_sim.analysis.engine import Setup
 from osel_sim.analysis.engine import replay as replay_all
+from osel_sim.analysis.gains import Gain
 from osel_sim.analysis.log import read_log
 from osel_sim.analysis.measures import Curves, gap_closed
+from osel_sim.api.replay import replay
+from osel_sim.cli.replay_tables import print_replay
 from osel_sim.core.errors import DataError
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.formats.rollout_log import write_rollouts
+from osel_sim.interface.selector import Choice
 from osel_sim.replay import main as replay_main
 from osel_sim.report import main as report_main
 from osel_sim.selection.reward import RewardWeights
@@ -115,9 +120,8 @@ def test_repeats_missing_outcomes_and_the_half(tmp_path: Path, log):
     assert 0 < result["learnable_oracle"]["repeated"] <= result["log"]["instances"]
     widths = {name: float(np.diff(entry["ci95"])[0]) for name, entry in result["oracles"].items()}
     assert widths["expected"] > widths["predictable"] + 0.01, "the expected oracle alone is an estimate, and its interval says so"
-    chance, best = result["selectors"]["random"], result["oracles"]["best_single"]["mean_reward"]
-    gap = result["oracles"]["predictable"]["mean_reward"] - best
-    assert chance["predictable_gap_closed"] == pytest.approx((chance["mean_reward"] - best) / gap) != chance["learnable_gap_closed"]
+    assert result["oracles"]["predictable"]["gain_ci95"][0] < 0.0 < result["oracles"]["predictable"]["gain"], "59 instances show no gap"
+    assert result["selectors"]["random"]["predictable_gap_closed"] is None and "No gap to close is seen" in result["verdict"]["text"]
     assert run(log, "--half", "score", "--selectors", "random", "--seeds", 2, "--decisions", 50, "--out", tmp_path / "half", *FREE) == 0
     result, choices = read_replay(tmp_path / "half")
     assert 250 < result["log"]["instances"] < 350 and choices.order.shape == (2, 50)
@@ -193,19 +197,51 @@ def test_a_log_of_scores_counts_them_as_success_and_is_reported(tmp_path: Path):
     assert "mean_score" in (tmp_path / "page-out" / "tables" / "selectors.csv").read_text().splitlines()[0]
 
 
-def test_a_gap_that_may_be_none_has_no_interval():
-    generator = np.random.default_rng(0)
-    base = generator.random((6, 50))
-    better = base + generator.normal(0.02, 0.5, (6, 50))
+def test_a_gap_within_its_error_is_not_shared():
+    base = np.random.default_rng(0).random((6, 50))
     nothing = np.zeros(RESAMPLES)
-    close = Curves({}, {"best_single": base, "expected": better}, "expected", 40, nothing)
-    far = Curves({}, {"best_single": base, "expected": base + 1.0}, "expected", 40, nothing)
-    assert 0.0 < (better - base).mean() < 0.1
-    share, interval = gap_closed(better, close, "expected", 0)
-    assert share == pytest.approx(1.0) and interval is None
-    share, interval = gap_closed(base + 0.5, far, "expected", 0)
+
+    def over(gain: float, error: float) -> Curves:
+        return Curves({}, {"best_single": base, "expected": base + gain}, "expected", 40, nothing, {"expected": Gain(gain, error)}, {})
+
+    share, interval = gap_closed(base + 0.5, over(1.0, 0.1), "expected", 0)
     assert (share, *interval) == pytest.approx((0.5, 0.5, 0.5))
-    assert gap_closed(base, Curves({}, {"best_single": base, "expected": base - 1.0}, "expected", 40, nothing), "expected", 0) is None
+    for gain, error in ((0.02, 0.02), (0.0, 0.0), (-1.0, 0.1)):
+        assert gap_closed(base - 1.0, over(gain, error), "expected", 0) is None
+    assert gap_closed(base, over(1.0, 0.1), "predictable", 0) is None  # a selector beat it: it is not among them
+
+
+def test_an_oracle_that_a_selector_beats_bounds_nothing(tmp_path: Path, capsys):
+    """Contexts and labels tell nothing, and the selector knows the outcomes: the log's oracles are no bounds of what it earns."""
+    generator = np.random.default_rng(2)
+    contexts = {f"i{row}": generator.normal(size=8).astype(np.float32) for row in range(200)}
+    outcomes = {key: generator.random(2) < 0.5 for key in contexts}
+    rows = [make_row(key, policy, success=bool(outcomes[key][at])) for key in contexts for at, policy in enumerate("ab")]
+    folder = write_log(tmp_path / "log", rows, contexts)
+
+    class Peeking:
+        def __init__(self, policies, context_dim, seed):
+            self.policies = tuple(policies)
+
+        def select(self, context):
+            key = min(contexts, key=lambda name: float(np.abs(contexts[name] - context).sum()))
+            best = int(outcomes[key].argmax())
+            return Choice("ab"[best], {"a": 1.0 - best, "b": float(best)})
+
+        def update(self, context, choice, reward):
+            pass
+
+    out = tmp_path / "out"
+    replay(folder, selectors=[Peeking, "thompson"], seeds=2, alpha_time=0, alpha_price=0, no_frontier=True, workers=1, out=out)
+    result, _ = read_replay(out)
+    assert set(result["oracles"]) == {"hindsight", "best_single"}
+    (name,) = set(result["learnable_oracle"]["beaten"].values())
+    assert "eeking" in name and result["learnable_oracle"]["name"] is None and result["selectors"][name]["learnable_gap_closed"] is None
+    assert "How much can be learned is not known" in result["verdict"]["text"]
+    print_replay(Console(width=200), result)
+    assert f"The predictable oracle is left out: {name} earned more" in capsys.readouterr().out
+    assert report_main([str(out), "--out", str(tmp_path / "page")]) == 0
+    assert "predictable oracle is left out" in (tmp_path / "page" / "report.html").read_text()
 
 
 def test_a_warm_start_spares_the_beginning(tmp_path: Path, log):

@@ -1,6 +1,6 @@
 """What a replay's choices came to: rewards with intervals, share of the learnable gap, regret, differences."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.estimate import Estimate, instance_draws, over_instances
+from osel_sim.analysis.gains import Gain, ahead_of, gain_of
 from osel_sim.analysis.log import Array, LoggedOutcomes
 from osel_sim.analysis.oracles import Oracles
 from osel_sim.analysis.outcomes import overall
@@ -15,11 +16,11 @@ from osel_sim.formats.replay_result import Choices
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.statistics.intervals import RESAMPLES, Interval, bootstrap_mean_interval, bootstrap_means
 
+UNBEATABLE = ("hindsight", "best_single")
+"""What needs no check: nobody earns more than the one, and to pass the other is what selectors are for."""
+
 LATE = 0.25
 """The share of a stream's decisions that counts as late."""
-
-NOT_APART = 0.025
-"""Of so many bootstrap draws without a gap on, its share has no interval: it is not bounded."""
 
 
 @dataclass(frozen=True)
@@ -28,18 +29,23 @@ class Curves:
 
     Attributes:
         selectors: name -> reward.
-        oracles: hindsight, expected (where there are repeats), predictable, per_task, best_single -> reward.
-        learnable: which oracle bounds what can be learned.
+        oracles: hindsight, expected (where there are repeats), predictable, per_task, best_single -> reward; less those that are `beaten`.
+        learnable: which oracle bounds what can be learned; None where those that could are beaten.
         late: first decision of the late part.
         expected_errors: how far the mean of the expected oracle may be off, as it was measured on the instances with repeats: bootstrap draws,
             (RESAMPLES,); zeros without repeats.
+        gains: oracle -> what it has over the best single policy.
+        beaten: oracle -> selector that earned more than it, beyond the error of the difference, over the whole stream or its last quarter. What is
+            beaten is no bound of anything.
     """
 
     selectors: dict[str, Array]
     oracles: dict[str, Array]
-    learnable: str
+    learnable: str | None
     late: int
     expected_errors: Array
+    gains: Mapping[str, Gain]
+    beaten: Mapping[str, str]
 
     def errors(self, oracle: str) -> Array:
         """How far the mean of an oracle may be off, (RESAMPLES,): only the expected one is an estimate."""
@@ -72,7 +78,14 @@ def curves(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: 
     received = {name: choices.received(name, table) for name in choices.chosen}
     gains = best.expected_gains
     errors = bootstrap_means(gains, seed=1) - gains.mean() if len(gains) else np.zeros(RESAMPLES)  # another seed than that of the streams' resampling
-    return Curves(received, found, best.learnable, decisions - max(1, int(decisions * LATE)), errors)
+    off = {"expected": float(errors.std())}
+    late = decisions - max(1, int(decisions * LATE))
+    over = {name: gain_of(choices.order, values - found["best_single"], off.get(name, 0.0)) for name, values in found.items()}
+    ahead = {name: ahead_of(values, received, choices.order, late, off.get(name, 0.0)) for name, values in found.items() if name not in UNBEATABLE}
+    beaten = {name: selector for name, selector in ahead.items() if selector is not None}
+    bounds = [name for name in (best.learnable, "predictable") if name not in beaten]
+    kept = {name: values for name, values in found.items() if name not in beaten}
+    return Curves(received, kept, bounds[0] if bounds else None, late, errors, over, beaten)
 
 
 def units(values: Array) -> Array:
@@ -132,13 +145,15 @@ def oracle_interval(rewards: Curves, oracle: str, instances: NDArray[Any]) -> In
     return float(low), float(high)
 
 
-def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tuple[float, Interval | None] | None:
+def gap_closed(received: Array, rewards: Curves, oracle: str | None, first: int) -> tuple[float, Interval] | None:
     """Share of the gap to an oracle closed from decision `first` on, with its 95 % bootstrap interval over seeds and, for the expected oracle, over
     the instances with repeats that it was measured on.
 
     (selector - best single) / (oracle - best single), all averaged over seeds and decisions. None where the oracle is not better than the best
-    single policy, so that there is no gap to close; no interval where it may well not be: more than `NOT_APART` of the draws have no gap.
+    single policy beyond its error, so that there is no gap to share, or is no bound because a selector beat it.
     """
+    if oracle not in rewards.oracles or not rewards.gains[oracle].beyond_error():
+        return None
     base = rewards.oracles["best_single"][:, first:]
     gains, gaps = units(received[:, first:] - base), units(rewards.oracles[oracle][:, first:] - base)
     if gaps.mean() <= 0.0:
@@ -146,8 +161,6 @@ def gap_closed(received: Array, rewards: Curves, oracle: str, first: int) -> tup
     share = float(gains.mean() / gaps.mean())
     # The same seed draws the same units for both.
     above, below = bootstrap_means(gains), bootstrap_means(gaps) + rewards.errors(oracle)
-    if (below <= 0.0).mean() > NOT_APART:
-        return share, None
     low, high = np.quantile(above[below > 0.0] / below[below > 0.0], [0.025, 0.975])
     return share, (float(low), float(high))
 
@@ -193,7 +206,7 @@ def _with_interval(name: str, estimate: Estimate | None) -> dict[str, Any]:
     return {name: None if estimate is None else [estimate.low, estimate.high]}
 
 
-def _gap_entries(name: str, found: tuple[float, Interval | None] | None) -> dict[str, Any]:
+def _gap_entries(name: str, found: tuple[float, Interval] | None) -> dict[str, Any]:
     share, interval = found or (None, None)
     return {name: share, f"{name}_ci95": None if interval is None else list(interval)}
 

@@ -4,23 +4,16 @@ Each says what a chooser would receive on every instance, so that it can be aver
 """
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.cross_fit import Rows, best_of_group, cross_fit
+from osel_sim.analysis.cross_fit import Rows, cross_fit
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
+from osel_sim.analysis.routers import SINGLE, Router, group_numbers, routers
 from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
-
-GROUPINGS = ("task", "target", "container", "phrasing", "robot")
-"""Attributes of an instance that the predictable oracle may know."""
-
-SHRINK = 4.0
-"""A group's mean rewards count as if so many more instances of the group had the mean of all: a small group says little."""
 
 
 @dataclass(frozen=True)
@@ -31,8 +24,8 @@ class Oracles:
         best_single, worst_single: columns of the policies with the highest and the lowest mean reward over all instances.
         expected: (N,) reward of the policy that was best on the same instance in other repeats, an estimate where it has none; None without repeats.
         expected_gains: what it has over `predictable` on each of the instances with repeats; the mean of `expected` is as sure as theirs.
-        predictable: (N,) reward of the policy that was best on *other* instances of the same group (by task, target, container, phrasing).
-        grouping: the attributes it went by, for each half of the instances (`first`, `second`) it was scored on.
+        predictable: (N,) reward of the policy that a supervised router, trained on *other* instances, names.
+        router: which one (`osel_sim.analysis.routers`), for each half of the instances (`first`, `second`) it was scored on.
         per_task: column of the policy with the highest mean reward on each instance's task, (N,).
     """
 
@@ -41,7 +34,7 @@ class Oracles:
     expected: Array | None
     expected_gains: Array
     predictable: Array
-    grouping: dict[str, tuple[str, ...]]
+    router: dict[str, str]
     per_task: NDArray[np.int64]
 
     @property
@@ -56,10 +49,10 @@ def oracles(log: LoggedOutcomes, weights: RewardWeights) -> Oracles:
     means = mean_over_repeats(rewards)
     if not len(means) or not np.isfinite(means).all():
         raise DataError(f"{log.source}: oracles need an outcome of every policy on every instance")
-    predictable, grouping = predictable_oracle(log, means)
+    predictable, router = predictable_oracle(log, means)
     overall = means.mean(axis=0)
     expected, gains = expected_oracle(rewards, predictable) or (None, np.zeros(0))
-    return Oracles(int(overall.argmax()), int(overall.argmin()), expected, gains, predictable, grouping, per_task(log, means))
+    return Oracles(int(overall.argmax()), int(overall.argmin()), expected, gains, predictable, router, per_task(log, means))
 
 
 def expected_oracle(rewards: Array, reference: Array) -> tuple[Array, Array] | None:
@@ -92,54 +85,48 @@ def expected_oracle(rewards: Array, reference: Array) -> tuple[Array, Array] | N
     return value, gains
 
 
-def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[str, tuple[str, ...]]]:
-    """Best policy of an instance's group, chosen on one half of the instances and scored on the other, both ways round.
+def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[str, str]]:
+    """Policy that a supervised router names for an instance, learned on one half of the instances and scored on the other, both ways round.
 
-    Which attributes make the groups is chosen on the choosing half as well (on one part of it, scored on the other): nothing scored had a say.
+    Which of the routers it is (one policy for all, the best of a group, a model of the contexts: `osel_sim.analysis.routers`) is chosen on the
+    learning half as well (from one part of it to the other, both ways round): nothing scored had a say. One policy for all it is unless another
+    was ahead by more than the standard error of the difference.
     The halves are other ones than the log's own, so that a log of which only one of those is replayed still has both.
 
     Args:
         means: (N, P) mean rewards.
 
     Returns:
-        its reward on every instance, (N,), and the grouping used for each half.
+        its reward on every instance, (N,), and the router used for each half.
     """
-    labels = {name: log.labels(name) for name in GROUPINGS}
-    varying = [name for name in GROUPINGS if len(set(labels[name])) > 1]
-    candidates = [names for size in range(len(varying) + 1) for names in combinations(varying, size)]
-    groups = {names: _groups([labels[name] for name in names], len(log)) for names in candidates}
+    from threadpoolctl import threadpool_limits
+
+    found = routers(log, means)
     half, quarter = (np.array([bool(hashlib.sha256(key.encode()).digest()[byte] & 1) for key in log.keys], bool) for byte in (1, 2))
-    used: list[tuple[str, ...]] = []
+    used: list[str] = []
 
     def decide(by: Rows, on: Rows) -> Array:
-        def held_out(names: tuple[str, ...]) -> float:
-            own, labels = means[by], groups[names][by]
-            return float(cross_fit(quarter[by], lambda inner, outer: _choose(own, labels, inner, outer)).sum())
+        parts = [(by & part, by & ~part) for part in (quarter, ~quarter)]
+        tried = {name: np.concatenate([_received(means, router, *part) for part in parts]) for name, router in found.items()}
+        best = max(tried, key=lambda name: float(tried[name].sum()))  # the first, which knows least, where several are equal
+        ahead = tried[best] - tried[SINGLE]
+        used.append(best if len(ahead) and ahead.sum() > ahead.std() * np.sqrt(len(ahead)) else SINGLE)
+        return _received(means, found[used[-1]], by, on)
 
-        best = max(candidates, key=held_out)  # the first, thus the coarsest, where several are equal
-        used.append(best)
-        return _choose(means, groups[best], by, on)
+    with threadpool_limits(1):  # the last bits of a matrix product depend on the number of threads
+        value = cross_fit(~half, decide)
+    return value, dict(zip(("first", "second"), used, strict=True))
 
-    return cross_fit(~half, decide), dict(zip(("first", "second"), used, strict=True))
+
+def _received(means: Array, router: Router, by: Rows, on: Rows) -> Array:
+    """Rewards on the instances `on` of the policies that a router learned to choose from the instances `by`."""
+    if not by.any() or not on.any():
+        return means[on].mean(axis=1)
+    return np.asarray(means[on, router(by, on)], np.float64)
 
 
 def per_task(log: LoggedOutcomes, means: Array) -> NDArray[np.int64]:
     """Column of the policy with the highest mean reward on each instance's task, (N,); chosen and scored on the same outcomes."""
-    groups = _groups([log.labels("task")], len(log))
+    groups = group_numbers([log.labels("task")], len(log))
     best = np.array([means[groups == group].mean(axis=0).argmax() for group in range(groups.max() + 1)], np.int64)
     return best[groups]
-
-
-def _choose(means: Array, groups: NDArray[np.int64], by: Rows, on: Rows) -> Array:
-    """Rewards on the instances `on` of the policy best in their group among the instances `by`."""
-    if not by.any() or not on.any():
-        return means[on].mean(axis=1)
-    return np.asarray(means[on, best_of_group(means, groups, by, on, SHRINK)], np.float64)
-
-
-def _groups(labels: Sequence[Sequence[str]], count: int) -> NDArray[np.int64]:
-    """Number of each instance's group, (N,), from one list of labels an attribute."""
-    if not labels:
-        return np.zeros(count, np.int64)
-    numbers: dict[tuple[str, ...], int] = {}
-    return np.array([numbers.setdefault(row, len(numbers)) for row in zip(*labels, strict=True)], np.int64)

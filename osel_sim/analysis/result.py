@@ -68,13 +68,16 @@ def build(
                 "mean_reward": float(values.mean()),
                 "ci95": list(oracle_interval(rewards, name, choices.order)),
                 "mean_reward_late": float(values[:, rewards.late :].mean()),
+                "gain": rewards.gains[name].mean,
+                "gain_ci95": rewards.gains[name].ends,
             }
             for name, values in rewards.oracles.items()
         },
         "learnable_oracle": {
             "name": rewards.learnable,
             "repeated": len(best.expected_gains),
-            "grouping": {half: list(names) for half, names in best.grouping.items()},
+            "router": best.router,
+            "beaten": dict(rewards.beaten),
         },
         "paired": paired(rewards, [*learners, *(name for name, entry in selectors.items() if entry["kind"] == "random"), BEST]),
         "verdict": verdict(rewards, learners, selectors, policies[best.best_single], reward_span(log.rewards(weights))),

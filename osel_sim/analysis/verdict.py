@@ -74,9 +74,13 @@ def verdict(rewards: Curves, learners: Sequence[str], measured: Mapping[str, Map
     proven = {name: advantage for name, advantage in found.items() if advantage.proven}
     # By what it earns once it has learned, where that is proven; a stream's beginning is paid once.
     best = max(proven or found, key=lambda name: (found[name].late + found[name].mean) / 2.0, default=None)
-    oracle_gain = float((rewards.oracles[rewards.learnable] - rewards.oracles["best_single"]).mean())
     decision = "route" if proven else "do_not_route"
-    stake: dict[str, Any] = {"learnable_oracle": rewards.learnable, "learnable_gain": oracle_gain}
+    learnable = None if rewards.learnable is None else rewards.gains[rewards.learnable]
+    stake: dict[str, Any] = {
+        "learnable_oracle": rewards.learnable,
+        "learnable_gain": None if learnable is None else learnable.mean,
+        "learnable_gain_ci95": None if learnable is None else learnable.ends,
+    }
     if best is not None:
         advantage, mine, fixed = found[best], measured[best], measured[f"fixed:{policy}"]
         stake |= {
@@ -88,7 +92,7 @@ def verdict(rewards: Curves, learners: Sequence[str], measured: Mapping[str, Map
             **{key: _difference(mine[key], fixed[key]) for key in ("success_rate", "mean_seconds", "mean_steps", "mean_price")},
         }
     decisions = rewards.oracles["best_single"].shape[1]
-    text = _text(decision, best, policy, found.get(best) if best else None, stake, decisions)
+    text = _text(decision, best, policy, found.get(best) if best else None, stake, decisions, _limit(rewards))
     return {
         "decision": decision,
         "selector": best if proven else None,
@@ -104,11 +108,7 @@ def verdict(rewards: Curves, learners: Sequence[str], measured: Mapping[str, Map
     }
 
 
-def _text(decision: str, best: str | None, policy: str, advantage: Advantage | None, stake: Mapping[str, Any], decisions: int) -> str:
-    bound = "" if stake["learnable_oracle"] == "expected" else " that knows what group (task, object, phrasing ...) an instance is of"
-    limit = f"An oracle{bound} gains {stake['learnable_gain']:+.3f} a decision over it."
-    if stake["learnable_gain"] <= 0.0:
-        limit = f"Nothing to learn can be seen: an oracle{bound} gains nothing over it."
+def _text(decision: str, best: str | None, policy: str, advantage: Advantage | None, stake: Mapping[str, Any], decisions: int, limit: str) -> str:
     if best is None or advantage is None:
         return f"Do not route: always use {policy}. {limit}"
     whole = f"{advantage.mean:+.3f} reward a decision over {decisions} decisions (between {advantage.low:+.3f} and {advantage.high:+.3f})"
@@ -117,6 +117,19 @@ def _text(decision: str, best: str | None, policy: str, advantage: Advantage | N
         cost = "" if advantage.low > 0.0 else " Learning costs something first: over the whole stream the gain is not proven."
         return f"Route with {best}: it gains {whole}, {late}, compared with always using {policy}.{cost} {_effects(stake)}{limit}"
     return f"Do not route: always use {policy}. No selector was shown to beat it: the best, {best}, came to {whole}, {late}. {_effects(stake)}{limit}"
+
+
+def _limit(rewards: Curves) -> str:
+    """What could be gained at most."""
+    if rewards.learnable is None:
+        return f"How much can be learned is not known: {rewards.beaten['predictable']} earned more than the predictable oracle."
+    gain = rewards.gains[rewards.learnable]
+    low, high = gain.interval
+    amount = f"{gain.mean:+.3f} a decision (between {low:+.3f} and {high:+.3f})"
+    oracle = "oracle" if rewards.learnable == "expected" else "oracle trained on all outcomes of the other half of the instances"
+    if not gain.beyond_error():
+        return f"No gap to close is seen: an {oracle} came to {amount} over it, which may be chance."
+    return f"An {oracle} gains {amount} over it."
 
 
 def _effects(stake: Mapping[str, Any]) -> str:

@@ -26,7 +26,7 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
             number(entry["mean_price"]),
             percent(entry["learnable_gap_closed"], entry["learnable_gap_closed_ci95"]),
             percent(entry["learnable_gap_closed_late"], entry["learnable_gap_closed_late_ci95"]),
-            number(entry["regret"][learnable], 3),
+            number(entry["regret"].get(learnable), 3),
             "-" if entry["decisions_until_ahead"] is None else str(entry["decisions_until_ahead"]),
         )
     table.add_section()
@@ -34,21 +34,31 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
         if name != "best_single":
             table.add(f"{name.replace('_', ' ')} oracle", _with_interval(entry["mean_reward"], entry["ci95"]))
     console.print(table)
-    notes = [f"gap closed and regret: by the {learnable} oracle; ahead at: from that decision on the sum of rewards exceeds the best policy's"]
+    by = f"gap closed and regret: by the {learnable} oracle; " if learnable else ""
+    notes = [f"{by}ahead at: from that decision on the sum of rewards exceeds the best policy's"]
+    gains = [f"{name.replace('_', ' ')} {_gain(entry)}" for name, entry in result["oracles"].items() if name != "best_single"]
+    notes.append(f"oracles over the best single policy, with intervals over instances: {', '.join(gains)}")
+    for oracle, selector in result["learnable_oracle"]["beaten"].items():
+        notes.append(f"The {oracle.replace('_', ' ')} oracle is left out: {selector} earned more, so it bounds nothing here.")
     learners = {name: entry for name, entry in result["selectors"].items() if entry["kind"] == "learner"}
-    if learnable != "predictable" and learners:
+    if learnable == "expected" and "predictable" in result["oracles"] and learners:
         best = max(learners, key=lambda name: float(learners[name]["mean_reward"]))
         whole, late = (
             percent(learners[best][f"predictable_gap_closed{part}"], learners[best][f"predictable_gap_closed{part}_ci95"]) for part in ("", "_late")
         )
         notes.append(f"of the gap to the predictable oracle {best} closed {whole}, in the last quarter {late}")
     if learnable == "predictable":
-        notes.append("no repeats, so there is no expected oracle: the gap is that of the predictable one (best policy by group, cross-fitted)")
+        notes.append("the predictable oracle is a router trained on all outcomes of one half of the instances and scored on the other half")
     if result["log"]["left_out"]["instances"]:
         notes.append(f"{log['left_out']['instances']} instances without an outcome of every policy were left out.")
     for note in notes:
         console.print(plain(note))
     console.print(plain(result["verdict"]["text"], "bold"), soft_wrap=True)
+
+
+def _gain(entry: Mapping[str, Any]) -> str:
+    ends = entry["gain_ci95"]
+    return f"{entry['gain']:+.3f}" + (f" [{ends[0]:+.3f}, {ends[1]:+.3f}]" if ends else "")
 
 
 def print_off_policy(console: Console, found: Mapping[str, Any]) -> None:

@@ -119,7 +119,7 @@ def _read(folder: Path, log_folder: Path | None) -> _Replay:
     names = _names(result)
     streams = _streams(log, weights, choices, names)
     always = {shown: name.removeprefix("fixed:") for name, shown in names.items() if name.startswith("fixed:")}
-    learnable = ORACLES[result["learnable_oracle"]["name"]]
+    learnable = ORACLES.get(result["learnable_oracle"]["name"], "")
     keep = {*_ends(result, names), *(names[name] for name in _learners(result)[:_MOST_SHOWN])}
     look = look_of(list(streams), log.policies, always, keep, learnable)
     return _Replay(folder, result, choices, log, weights, names, streams, look, learnable)
@@ -265,10 +265,17 @@ def _verdict(result: Mapping[str, Any]) -> Verdict:
         gain, late = stake["gain"], stake["gain_late"]
         tiles.append(Tile(f"{stake['selector']} over it", signed(gain), f"reward a decision, bounds {bounds(*stake['gain_bounds'])}"))
         tiles.append(Tile("in the last quarter", signed(late), f"reward a decision, bounds {bounds(*stake['gain_late_bounds'])}"))
-    learnable = ORACLES[stake["learnable_oracle"]]
-    gain = signed(stake["learnable_gain"]) if stake["learnable_gain"] > 0.0 else "none seen"
-    tiles.append(Tile("learnable gain", gain, f"reward a decision: {learnable}"))
+    tiles.append(_learnable(stake))
     return Verdict(headline, [text[:1].upper() + text[1:]], tiles, "good" if route else "neutral")
+
+
+def _learnable(stake: Mapping[str, Any]) -> Tile:
+    """What could be gained at most."""
+    name, ends = stake["learnable_oracle"], stake.get("learnable_gain_ci95")
+    if name is None:
+        return Tile("learnable gain", "not known", "selectors earned more than the oracles")
+    oracle = f"reward a decision: {ORACLES[name]}" + (f", {bounds(*ends)}" if ends else "")
+    return Tile("learnable gain", "no gap to close" if ends and ends[0] <= 0.0 else signed(stake["learnable_gain"]), oracle)
 
 
 def _facts(folder: Path, result: Mapping[str, Any], log: LoggedOutcomes, weights: RewardWeights) -> list[tuple[str, str]]:

@@ -31,7 +31,8 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
         names: selector -> what it is called on the page.
     """
     rows: list[dict[str, Cell]] = []
-    predictable = result["learnable_oracle"]["name"] == "predictable"
+    learnable = result["learnable_oracle"]["name"]
+    predictable = learnable != "expected" or "predictable" not in result["oracles"]
     also = _measures(result["reward"])
     shown = sorted(names, key=lambda name: -float(result["selectors"][name]["mean_reward"]))
     for name in shown:
@@ -61,10 +62,10 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
     over = _over_seeds(result)
     caption = (
         "The best first. Mean reward and success: with 95% bootstrap intervals over instances, of fixed policies over all repeats as in the table of "
-        f"policies. Gap and regret: {over[:1].lower()}{over[1:]} Those of the gap are also over what the expected oracle may be off; a gap without "
-        "one may be none. "
+        f"policies. Gap and regret: {over[:1].lower()}{over[1:]} Those of the gap are also over what the expected oracle may be off. "
         "Regret: reward a decision below the oracle. Gap closed: share of the way "
-        f"from the best single policy to the learnable oracle{'' if predictable else ', in the last quarter also to the predictable one'}. "
+        f"from the best single policy to the {ORACLES.get(learnable, 'learnable oracle')}{'' if predictable else ', also to the predictable one'}; "
+        "a dash where there is no gap to close, or none that is more than its error. "
         "Ahead after: decisions until its rewards pass the best single policy's for good."
     )
     if any(name.endswith(":warm") for name in names):
@@ -84,20 +85,35 @@ def oracle_table(result: Mapping[str, Any]) -> Table:
     meaning = {
         "hindsight": "best outcome of each decision, known only afterwards: optimistic, not learnable where outcomes are noisy",
         "expected": "best policy of each instance by its mean over some repeats, scored on the others",
-        "predictable": "best policy by what can be known of an instance (task, object, container, phrasing), chosen on other instances",
+        "predictable": f"supervised router trained on all outcomes of one half of the instances, scored on the other half{_routers(result)}",
         "per_task": "best policy of each task",
         "best_single": "best policy over all instances",
     }
     rows: list[dict[str, Cell]] = [
-        {"oracle": ORACLES.get(name, name.replace("_", " ")), "reward": _estimate(entry, "mean_reward", "ci95"), "meaning": meaning.get(name, "")}
+        {
+            "oracle": ORACLES.get(name, name.replace("_", " ")),
+            "reward": _estimate(entry, "mean_reward", "ci95"),
+            "gain": None if name == "best_single" else _estimate(entry, "gain", "gain_ci95"),
+            "meaning": meaning.get(name, ""),
+        }
         for name, entry in result["oracles"].items()
     ]
-    columns = [Column("oracle", "oracle", "text"), Column("reward", "mean reward", digits=3), Column("meaning", "what it is", "text")]
-    learnable = ORACLES[result["learnable_oracle"]["name"]]
-    caption = f"The learnable gap is that between the best single policy and the {learnable}."
-    if repeated := result["learnable_oracle"].get("repeated"):
+    columns = [
+        *(Column("oracle", "oracle", "text"), Column("reward", "mean reward", digits=3), Column("gain", "over the best single policy", digits=3)),
+        Column("meaning", "what it is", "text"),
+    ]
+    learnable, beaten = result["learnable_oracle"]["name"], result["learnable_oracle"].get("beaten", {})
+    caption = f"The learnable gap is that between the best single policy and the {ORACLES[learnable]}." if learnable else ""
+    caption += " Intervals of the gains are over instances: a gain whose interval reaches zero is no gap to close."
+    caption += "".join(f" The {ORACLES[name]} is left out: {selector} earned more, so it bounds nothing here." for name, selector in beaten.items())
+    if (repeated := result["learnable_oracle"].get("repeated")) and "expected" in result["oracles"]:
         caption += f" The expected one is an estimate, from the {repeated} of {result['log']['instances']} instances that have repeats."
     return Table("oracles", "What could have been", caption, columns, rows)
+
+
+def _routers(result: Mapping[str, Any]) -> str:
+    found = dict.fromkeys(result["learnable_oracle"].get("router", {}).values())
+    return f" (here by {' and '.join(found)})" if found else ""
 
 
 def paired_tables(result: Mapping[str, Any], names: Mapping[str, str]) -> list[Table]:

@@ -183,7 +183,6 @@ def gap_figure(gaps: Mapping[str, tuple[Estimate | float | None, Estimate | floa
     shown.sort(key=lambda name: -max(part[name].value for part in found.values() if name in part))
     scaled = {label: {name: Estimate(100 * own.value, 100 * own.low, 100 * own.high) for name, own in part.items()} for label, part in found.items()}
     caption = f"0% is the best single policy, 100% the {oracle}. With 95% intervals over seeds and over what the expected oracle may be off."
-    caption += " A selector that sees more than an oracle by groups can pass it."
     ends = [f"{name} {scaled['last quarter'][name].value:.0f}%" for name in shown if name in scaled["last quarter"]]
     text = f"Dots with intervals, a row for each selector. Share of the gap to the {oracle} closed in the last quarter: {listed(ends)}."
     look = Look({"whole stream": "muted", "last quarter": "ink"}, shapes={"last quarter": "diamond"})

@@ -29,12 +29,13 @@ def prepare() -> None:
 
     sizes, batch = np.array([1, 2, 2], np.int64), 1
     actor, critic = ((*(_aligned((10,)) for _ in range(3)), sizes) for _ in range(2))
-    work = [_aligned((2, batch, 2)) for _ in range(6)]
+    layers = (2, batch, 2)
+    work = [_aligned(shape) for _ in range(2) for shape in ((2, *layers), (2, *layers), layers)]
     contexts, numbers, actions = _aligned((batch, 1)), np.zeros(batch, np.float32), np.zeros(batch, np.int64)
     with announced("the training of ppo"):
-        forward(actor[0], actor[3], contexts, work[0])
-        log_softmax(work[0][-1], np.zeros((batch, 2)))
-        room, settings = _aligned((LINE,)), (1e-3, 1.0, 0.2, 0.0, 0.5, 0.5, -1.0)
+        forward(actor[0], actor[3], contexts, work[0], False)
+        log_softmax(work[0][0, -1], np.zeros((batch, 2)))
+        room, settings = _aligned((LINE,)), (1e-3, 1.0, 0.2, 0.0, 0.5, 0.5, -1.0, 0.0)
         train(actor, critic, np.zeros(1, np.int64), contexts, actions, numbers, numbers, numbers, contexts, (*work, room), settings)
 
 
@@ -64,7 +65,8 @@ class FastPPO:
         self._n_steps = int(settings["n_steps"])
         target_kl = settings["target_kl"]
         names = ("learning_rate", "n_epochs", "clip_range", "ent_coef", "vf_coef", "max_grad_norm")
-        self._settings = (*(float(settings[name]) for name in names), -1.0 if target_kl is None else float(target_kl))
+        self._gelu = settings["activation"] == "gelu"
+        self._settings = (*(float(settings[name]) for name in names), -1.0 if target_kl is None else float(target_kl), float(self._gelu))
         state = {key: value.numpy() for key, value in selector.algorithm.policy.state_dict().items()}
         self.actor = _tower(state, "policy_net", "action_net")
         self.critic = _tower(state, "value_net", "value_net")
@@ -88,7 +90,8 @@ class FastPPO:
         widest = int(max(self.actor[3][1:]))
 
         def buffers(tower: "Tower") -> list[NDArray[np.float32]]:
-            return [_aligned((len(tower[3]) - 1, size, widest)) for _ in range(3)]
+            shape = (len(tower[3]) - 1, size, widest)
+            return [_aligned((2, *shape)), _aligned((2, *shape)), _aligned(shape)]
 
         actor, critic = buffers(self.actor), buffers(self.critic)
         inputs, following = _aligned((size, contexts.shape[1])), _aligned((size, contexts.shape[1]))
@@ -99,17 +102,17 @@ class FastPPO:
             inputs, following = following, inputs
             count = min(size, total - start)
             if not ready:
-                forward(self.actor[0], self.actor[3], inputs, actor[0])
-                forward(self.critic[0], self.critic[3], inputs, critic[0])
+                forward(self.actor[0], self.actor[3], inputs, actor[0], self._gelu)
+                forward(self.critic[0], self.critic[3], inputs, critic[0], self._gelu)
             log_probabilities = np.empty((count, policies))
-            log_softmax(actor[0][-1], log_probabilities)
+            log_softmax(actor[0][0, -1], log_probabilities)
             actions = self._draw(log_probabilities)
             chosen[start : start + count] = actions
             if count < size:
                 break
             rows = np.arange(size)
             received = rewards[start + rows, actions].astype(np.float32)
-            values = critic[0][-1, :, 0].copy()
+            values = critic[0][0, -1, :, 0].copy()
             advantages = received - values
             returns = advantages + values
             normalised = (advantages - advantages.mean()) / (advantages.std(ddof=1) + np.float32(1e-8))

@@ -7,9 +7,12 @@ time two and a half million weights at most, their gradients and two moments eac
 - its norm, which clipping needs beforehand, comes from the products of deltas and of inputs among the few decisions of the rollout;
 - the forward pass after a step happens in the same visit, on the rows just written.
 
-A tower (policy or value network) is a chain of fully connected layers with tanh between them, its weights and biases in one flat float32 array:
-layer after layer, the matrix (outputs, inputs) by rows, then the bias.
+A tower (policy or value network) is a chain of fully connected layers with tanh or GELU between them, its weights and biases in one flat float32
+array: layer after layer, the matrix (outputs, inputs) by rows, then the bias. What it makes of a batch is float32 (2, layers, batch, widest): each
+layer's outputs, and the slopes of the function between layers where they were formed.
 """
+
+import math
 
 import numpy as np
 
@@ -115,17 +118,28 @@ def adam(weights, first, second, gradient, rate, root):  # type: ignore[no-untyp
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def squash(values, batch, width):  # type: ignore[no-untyped-def]
-    """tanh of values[:batch, :width], in place."""
+def squash(values, slopes, batch, width, gelu):  # type: ignore[no-untyped-def]
+    """tanh or GELU of values[:batch, :width], in place, and its slopes there."""
+    half, root = np.float32(0.5), np.float32(math.sqrt(0.5))
+    peak = np.float32(1.0 / math.sqrt(2.0 * math.pi))
     for b in range(batch):
         for i in range(width):
-            values[b, i] = np.tanh(values[b, i])
+            x = values[b, i]
+            if gelu:
+                below = half * (np.float32(1.0) + np.float32(math.erf(x * root)))
+                values[b, i] = x * below
+                slopes[b, i] = below + x * peak * np.exp(-half * x * x)
+            else:
+                y = np.tanh(x)
+                values[b, i] = y
+                slopes[b, i] = np.float32(1.0) - y * y
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def forward(weights, sizes, inputs, activations):  # type: ignore[no-untyped-def]
-    """Run a tower. `inputs` (batch, sizes[0]); `activations` (layers, batch, widest) is filled, the last of it with the outputs, without tanh."""
+def forward(weights, sizes, inputs, passed, gelu):  # type: ignore[no-untyped-def]
+    """Run a tower. `inputs` (batch, sizes[0]); `passed` is filled, its last layer with the outputs as they are."""
     batch = inputs.shape[0]
+    activations, slopes = passed[0], passed[1]
     offset = 0
     for layer in range(len(sizes) - 1):
         n_in, n_out = sizes[layer], sizes[layer + 1]
@@ -133,14 +147,14 @@ def forward(weights, sizes, inputs, activations):  # type: ignore[no-untyped-def
         bias = offset + n_in * n_out
         products(weights[offset:bias].reshape(n_out, n_in), weights[bias : bias + n_out], given, batch, activations[layer])
         if layer < len(sizes) - 2:
-            squash(activations[layer], batch, n_out)
+            squash(activations[layer], slopes[layer], batch, n_out, gelu)
         offset = bias + n_out
 
 
 # Inlined, because otherwise what a process has compiled itself and what it takes from the cache round differently, and replays with them.
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy", inline="always")
-def backward(weights, sizes, activations, deltas, batch):  # type: ignore[no-untyped-def]
-    """Carry `deltas[-1]` (the loss by the outputs) back to all layers: deltas (layers, batch, widest) by each layer's sums before tanh."""
+def backward(weights, sizes, slopes, deltas, batch):  # type: ignore[no-untyped-def]
+    """Carry `deltas[-1]` (the loss by the outputs) back to all layers: deltas (layers, batch, widest) by each layer's sums."""
     layers = len(sizes) - 1
     end = 0
     for layer in range(layers):
@@ -159,8 +173,7 @@ def backward(weights, sizes, activations, deltas, batch):  # type: ignore[no-unt
                     into[j] += delta * row[j]
         for b in range(batch):
             for j in range(n_in):
-                value = activations[layer - 1, b, j]
-                deltas[layer - 1, b, j] *= np.float32(1.0) - value * value
+                deltas[layer - 1, b, j] *= slopes[layer - 1, b, j]
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
@@ -184,13 +197,14 @@ def squared_norm(sizes, inputs, activations, deltas):  # type: ignore[no-untyped
 
 
 @njit(cache=True, fastmath=True, nogil=True, error_model="numpy")
-def step(weights, first, second, sizes, inputs, activations, deltas, scale, rate, root, following, outputs, gradient):  # type: ignore[no-untyped-def]
+def step(weights, first, second, sizes, inputs, activations, deltas, scale, rate, root, following, passed, gradient, gelu):  # type: ignore[no-untyped-def]
     """One step of Adam on a tower, and the forward pass on the new weights.
 
-    `first`, `second`: Adam's moments. `scale`: of the gradient, from clipping. `rate`, `root`: learning rate over the first, and square root of the
-    second bias correction. `following` (batch, sizes[0]): inputs of the forward pass, whose activations go to `outputs`.
+    `first`, `second`: Adam's moments. `activations`: of `inputs`. `scale`: of the gradient, from clipping. `rate`, `root`: learning rate over the
+    first, and square root of the second bias correction. `following` (batch, sizes[0]): inputs of the forward pass, which fills `passed`.
     `gradient`: room for the gradient of some rows at a time (`BLOCK`), at least of one.
     """
+    outputs, slopes = passed[0], passed[1]
     batch, ahead = inputs.shape[0], following.shape[0]
     offset = 0
     by_bias = np.empty(max(sizes), np.float32)
@@ -212,7 +226,7 @@ def step(weights, first, second, sizes, inputs, activations, deltas, scale, rate
             matrix = weights[low:high].reshape(stop - start, n_in)
             products(matrix, weights[low_bias:high_bias], taken, ahead, outputs[layer, :, start:stop])
         if layer < len(sizes) - 2:
-            squash(outputs[layer], ahead, n_out)
+            squash(outputs[layer], slopes[layer], ahead, n_out, gelu)
         offset = bias + n_out
 
 
@@ -241,21 +255,22 @@ def train(actor, critic, counts, inputs, actions, old, advantages, returns, foll
         inputs: float32 (batch, dim). actions: int64 (batch,). old: log probabilities of the actions when they were chosen.
         advantages: normalised. returns: what the value network is to say.
         following: (ahead, dim) contexts of the next rollout.
-        work: (actor's activations, spare, deltas, critic's activations, spare, deltas, room for `step`); the activations are those of `inputs` at
-            the present weights.
-        settings: (learning_rate, n_epochs, clip_range, ent_coef, vf_coef, max_grad_norm, target_kl; negative: none).
+        work: (what passed the actor, spare, deltas, what passed the critic, spare, deltas, room for `step`); what passed is of `inputs` at the
+            present weights.
+        settings: (learning_rate, n_epochs, clip_range, ent_coef, vf_coef, max_grad_norm, target_kl; negative: none; 1 for GELU).
 
     Returns:
-        which of the two activations (0: the first of `work`, 1: the spare) are now those of `following`; -1: neither, it ended before the last epoch.
+        which of the two (0: the first of `work`, 1: the spare) are now those of `following`; -1: neither, it ended before the last epoch.
     """
-    learning_rate, n_epochs, clip_range, ent_coef, vf_coef, max_grad_norm, target_kl = settings
+    learning_rate, n_epochs, clip_range, ent_coef, vf_coef, max_grad_norm, target_kl, activation = settings
+    gelu = activation > 0.0
     actor_now, actor_next, actor_deltas, critic_now, critic_next, critic_deltas, gradient = work
     batch = len(actions)
     policies = actor[3][-1]
     log_probabilities = np.empty((batch, policies), np.float64)
     epochs = int(n_epochs)
     for epoch in range(epochs):
-        log_softmax(actor_now[-1], log_probabilities)
+        log_softmax(actor_now[0, -1], log_probabilities)
         divergence = 0.0
         for b in range(batch):
             difference = log_probabilities[b, actions[b]] - old[b]
@@ -275,17 +290,17 @@ def train(actor, critic, counts, inputs, actions, old, advantages, returns, foll
                 chosen = 1.0 if k == actions[b] else 0.0
                 by_logit = by_log_probability * (chosen - probability)
                 actor_deltas[-1, b, k] = by_logit + ent_coef / batch * probability * (log_probabilities[b, k] + entropy)
-            critic_deltas[-1, b, 0] = vf_coef * 2.0 / batch * (critic_now[-1, b, 0] - returns[b])
-        backward(actor[0], actor[3], actor_now, actor_deltas, batch)
-        backward(critic[0], critic[3], critic_now, critic_deltas, batch)
-        square = squared_norm(actor[3], inputs, actor_now, actor_deltas) + squared_norm(critic[3], inputs, critic_now, critic_deltas)
+            critic_deltas[-1, b, 0] = vf_coef * 2.0 / batch * (critic_now[0, -1, b, 0] - returns[b])
+        backward(actor[0], actor[3], actor_now[1], actor_deltas, batch)
+        backward(critic[0], critic[3], critic_now[1], critic_deltas, batch)
+        square = squared_norm(actor[3], inputs, actor_now[0], actor_deltas) + squared_norm(critic[3], inputs, critic_now[0], critic_deltas)
         scale = min(1.0, max_grad_norm / (np.sqrt(max(square, 0.0)) + 1e-6))
         counts[0] += 1
         rate = learning_rate / (1.0 - BETA1 ** counts[0])
         root = np.sqrt(1.0 - BETA2 ** counts[0])
         seen = following if epoch == epochs - 1 else inputs
-        step(actor[0], actor[1], actor[2], actor[3], inputs, actor_now, actor_deltas, scale, rate, root, seen, actor_next, gradient)
-        step(critic[0], critic[1], critic[2], critic[3], inputs, critic_now, critic_deltas, scale, rate, root, seen, critic_next, gradient)
+        step(actor[0], actor[1], actor[2], actor[3], inputs, actor_now[0], actor_deltas, scale, rate, root, seen, actor_next, gradient, gelu)
+        step(critic[0], critic[1], critic[2], critic[3], inputs, critic_now[0], critic_deltas, scale, rate, root, seen, critic_next, gradient, gelu)
         actor_now, actor_next = actor_next, actor_now
         critic_now, critic_next = critic_next, critic_now
     return epochs % 2

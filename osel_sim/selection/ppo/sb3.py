@@ -1,13 +1,13 @@
 """stable-baselines3's PPO with the paper's settings, driven decision by decision."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from osel_sim.core.errors import UsageError
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.random_streams import RandomStreams
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 ROLLOUT = ("observations", "actions", "rewards", "values", "log_probs", "episode_starts")
 """Arrays of SB3's rollout buffer that hold decisions; returns and advantages are computed from them when it is full."""
+
+Activation = Literal["tanh", "gelu"]
 
 ENDED = np.ones(1, np.float32)
 """Every decision is an episode of its own, so each begins one and each ends one."""
@@ -45,9 +47,11 @@ class PPOSelector(SelectorBase):
         max_grad_norm: gradients are clipped to this norm.
         target_kl: a training step ends when the policy has moved 1.5 times this far; None never ends it.
         layers: hidden layers of the policy network and of the value network, which share nothing.
+        activation: between layers: `tanh`, SB3's default, or `gelu`, as in the code of the paper's authors (`benchmarks/paper_figure5.py`).
 
     Raises:
         UsageError: a number out of range.
+        UnknownNameError: no such activation.
     """
 
     name: ClassVar[str] = "ppo"
@@ -72,6 +76,7 @@ class PPOSelector(SelectorBase):
         max_grad_norm: float = 0.5,
         target_kl: float | None = 0.003,
         layers: Sequence[int] = (768, 512, 128, 64, 16),
+        activation: Activation = "tanh",
     ) -> None:
         super().__init__(policies, context_dim, seed)
         # Normalising the advantage of a single decision divides by nothing (SB3 issue 440).
@@ -85,6 +90,8 @@ class PPOSelector(SelectorBase):
                 raise UsageError(f"{setting} must be at least {least}, got {value}")
         if not learning_rate > 0.0:
             raise UsageError(f"learning_rate must be positive, got {learning_rate}")
+        if activation not in get_args(Activation):
+            raise UnknownNameError("activation", activation, get_args(Activation))
         self._settings: dict[str, Any] = {
             "learning_rate": learning_rate,
             "n_steps": n_steps,
@@ -100,6 +107,7 @@ class PPOSelector(SelectorBase):
             "max_grad_norm": max_grad_norm,
             "target_kl": target_kl,
             "layers": list(layers),
+            "activation": activation,
         }
         self._random = RandomStreams(seed)
         # Contexts are copied here: torch aligns its own memory, numpy does not, and the matrix library may round by alignment.
@@ -143,9 +151,11 @@ class PPOSelector(SelectorBase):
 
         # SB3 reads the two spaces from an environment; this one is never stepped.
         spaces = SelectionEnv(table_rounds(np.zeros((1, self._network_dim)), np.zeros((1, len(policies)))), policies, self._network_dim)
-        arguments = {key: value for key, value in self._settings.items() if key != "layers"}
+        arguments = {key: value for key, value in self._settings.items() if key not in ("layers", "activation")}
+        between = torch.nn.GELU if self._settings["activation"] == "gelu" else torch.nn.Tanh
+        network = {"net_arch": list(self._settings["layers"]), "activation_fn": between}
         with self._random.in_use():
-            algorithm = PPO("MlpPolicy", spaces, policy_kwargs={"net_arch": list(self._settings["layers"])}, device="cpu", **arguments)
+            algorithm = PPO("MlpPolicy", spaces, policy_kwargs=network, device="cpu", **arguments)
         algorithm.set_logger(Logger(None, []))
         return algorithm
 

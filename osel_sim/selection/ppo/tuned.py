@@ -66,7 +66,7 @@ class TunedPPOSelector(PPOSelector):
     @property
     def settings(self) -> dict[str, Any]:
         """Hyper-parameters, as the constructor takes them."""
-        fixed = ("batch_size", "gamma", "gae_lambda", "clip_range_vf", "normalize_advantage")
+        fixed = ("activation", "batch_size", "gamma", "gae_lambda", "clip_range_vf", "normalize_advantage")
         return {"components": self._scale.dim, **{key: value for key, value in super().settings.items() if key not in fixed}}
 
     @property
