@@ -64,18 +64,26 @@ def test_nothing_is_said_about_what_could_not_have_been_chosen():
 
 
 def test_each_estimate_says_on_how_many_decisions_it_rests():
-    """100 decisions, each policy as likely as the other; the second was chosen in 80 of them, and always paid 0.5."""
-    chosen = np.repeat([0, 1], [20, 80])
-    propensities, target = np.full((100, 2), 0.5), np.tile([0.0, 1.0], (100, 1))
-    result = estimate(np.full(100, 0.5), chosen, propensities, target)
+    """400 decisions, each policy as likely as the other; the second was chosen in 320 of them, and always paid 0.5."""
+    chosen = np.repeat([0, 1], [80, 320])
+    propensities, target = np.full((400, 2), 0.5), np.tile([0.0, 1.0], (400, 1))
+    result = estimate(np.full(400, 0.5), chosen, propensities, target)
     assert (result.ips, result.snips, result.mean_weight) == pytest.approx((0.8, 0.5, 1.6))  # by so much ips is off, and this is why
-    assert (result.effective_decisions, result.snips_effective, result.dr_effective) == (80.0, 80.0, 80.0)
-    assert result.ips_effective == pytest.approx(100**2 / (80 * 2.0**2)) == 31.25
+    assert result.effective_decisions == 320.0
+    assert result.snips_effective == result.dr_effective == 200.0  # the propensities promised no more
+    assert result.ips_effective == pytest.approx(400**2 / (320 * 2.0**2)) == 125.0
     assert result.few == ()
-    rare = estimate(np.full(100, 0.5), chosen, propensities, np.tile([1.0, 0.0], (100, 1)))
-    assert rare.few == ("ips", "snips", "dr") and rare.ips_effective == rare.snips_effective == 20.0
-    never = estimate(np.full(100, 0.5), np.ones(100), propensities, np.tile([1.0, 0.0], (100, 1)))
+    rare = estimate(np.full(400, 0.5), chosen, propensities, np.tile([1.0, 0.0], (400, 1)))
+    assert rare.few == ("ips", "snips", "dr") and rare.ips_effective == rare.snips_effective == 80.0
+    never = estimate(np.full(400, 0.5), np.ones(400), propensities, np.tile([1.0, 0.0], (400, 1)))
     assert never.few == ("ips", "snips", "dr") and never.snips is None and never.ips_effective == 0.0
+
+
+def test_a_rare_choice_that_was_not_made_does_not_make_an_estimate_look_sure():
+    """The target would choose the second policy in one of ten decisions, the run in one of ten thousand, and it never did."""
+    chosen, propensities = np.zeros(500, np.int64), np.tile([0.9999, 0.0001], (500, 1))
+    result = estimate(np.ones(500), chosen, propensities, np.tile([0.9, 0.1], (500, 1)))
+    assert result.effective_decisions == pytest.approx(500.0) and result.few == ("ips", "snips", "dr")
 
 
 def test_wrong_input():

@@ -221,7 +221,7 @@ def test_what_is_not_known_is_no_warning(case, tmp_path):
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     kept = [line for line in lines if case != "one policy chosen" or line["policy"] == NEAR]
     for index, line in enumerate(kept):
-        line["index"] = index
+        line |= {"index": index, "seed": lines[0]["seed"] + index}
         if case == "one policy always fails" and line["policy"] == FAR:
             line |= {"error": "gone", "success": False, "reward": None}
     file.write_text("".join(json.dumps(line) + "\n" for line in kept))

@@ -85,7 +85,7 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
             check_reward(others.rewards[policy], outcome, weights, f"{folder / COUNTERFACTUAL}, line {decision.index + 1}: {policy}")
             rows.append(_row(decision, policy, outcome))
     if (folder / COUNTERFACTUAL).exists() or configuration.get("counterfactual") is True:
-        check_beside(folder / COUNTERFACTUAL, len(decisions), complete=True)
+        check_beside(folder / COUNTERFACTUAL, len(journal), complete=True)
     keys = [instance.key for instance in instances]
     identity, contexts = read_contexts(folder, keys, encoder or configuration.get("encoder"))
     arrays = dense(folder, rows, keys, policies)

@@ -14,8 +14,10 @@ from osel_sim.analysis.log import Array
 from osel_sim.core.errors import UsageError
 from osel_sim.statistics.intervals import Interval
 
-LEAST_EFFECTIVE = 30.0
-"""Estimates that rest on fewer effective decisions are shown nowhere: normal intervals of so few do not hold, and one lucky choice decides."""
+LEAST_EFFECTIVE = 100.0
+"""Estimates that rest on fewer effective decisions are shown nowhere: normal intervals of so few do not hold, and one lucky choice decides. In
+simulated runs of `auto`, `thompson` and `lints` 95 % intervals of all three hold the truth in 93 to 98 % from here on, in 40 to 90 % below
+(`benchmarks/coverage.py`)."""
 
 WAYS = ("ips", "snips", "dr")
 """Fields of `OffPolicyEstimate`, each with its `_ci95` and `_effective`."""
@@ -41,6 +43,8 @@ class OffPolicyEstimate:
         ips_effective, snips_effective, dr_effective: how many decisions made by the target itself would weigh as much. For snips and dr Kish's
             number of the weights, (sum w)^2 / sum w^2. ips takes the mean weight for the 1 that it is on average; where it came out higher, few
             decisions count for many, and the number is T^2 / sum w^2 (Elvira, Martino and Robert 2018, "Rethinking the effective sample size").
+            None is above what the propensities promise, T^2 / sum of target^2 / propensity over all policies: where a rare choice that
+            would have weighed much happened not to be made, the weights that were drawn look better than they are.
         effective_decisions: Kish's number.
         mean_weight: what ips takes for 1; ips is snips times this.
         unsupported: share of the target's choices that the run could never have made, so that nothing is known of them; the estimates are None
@@ -97,7 +101,9 @@ def estimate(rewards: ArrayLike, chosen: ArrayLike, propensities: ArrayLike, tar
     squares = float((weights**2).sum())
     effective = float(weights.sum()) ** 2 / squares if squares > 0.0 else 0.0
     mean_weight = float(weights.mean())
-    counts = (min(effective, len(weights) ** 2 / squares) if squares > 0.0 else 0.0, effective, effective, effective, mean_weight, unsupported)
+    promised = np.divide(wanted**2, behaviour, out=np.zeros_like(wanted), where=behaviour > 0.0).sum()
+    own = min(effective, len(weights) ** 2 / float(promised)) if promised > 0.0 else 0.0
+    counts = (min(own, len(weights) ** 2 / squares) if squares > 0.0 else 0.0, own, own, effective, mean_weight, unsupported)
     if unsupported > 0.0 or effective == 0.0:
         return OffPolicyEstimate(None, None, None, None, None, None, *counts)
     snips = float((weights * received).sum() / weights.sum())

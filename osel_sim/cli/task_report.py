@@ -4,10 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.markup import escape
-from rich.table import Table
-
-from osel_sim.cli.console import console
+from osel_sim.cli.console import Table, console, plain
 from osel_sim.core.errors import UsageError
 
 if TYPE_CHECKING:
@@ -36,10 +33,10 @@ def find_task_file(task: str, folder: Path | None, robot: str | None) -> "tuple[
 
 def print_attempts(task: "TaskSpec", attempts: "Sequence[Attempt]") -> None:
     """The attempts as a table, and how many of them came to the goal."""
-    table = Table("instance", "instruction", "done", "why not", title=f"The scripted expert on {escape(task.name)}", title_justify="left")
+    table = Table(f"The scripted expert on {task.name}", ("instance", "instruction", "done", "why not"))
     for attempt in attempts:
-        done = f"{attempt.steps} of {task.horizon} steps" if attempt.success else "[red]no[/]"
-        table.add_row(escape(attempt.instance), escape(attempt.instruction), done, escape("\n".join(attempt.reasons)))
+        done = plain(f"{attempt.steps} of {task.horizon} steps") if attempt.success else plain("no", "red")
+        table.add(attempt.instance, attempt.instruction, done, "\n".join(attempt.reasons))
     console().print(table)
     solved = sum(attempt.success for attempt in attempts)
-    console().print(f"{escape(str(task.file))} is well formed; the scripted expert solves {solved} of {len(attempts)} instances")
+    console().print(f"{task.file} is well formed; the scripted expert solves {solved} of {len(attempts)} instances")

@@ -33,7 +33,7 @@ def load_image(source: Path | bytes, where: str) -> NDArray[np.uint8]:
     try:
         with pillow.open(source if isinstance(source, Path) else io.BytesIO(source)) as image:
             if image.width * image.height > MOST_PIXELS:
-                raise DataError(_too_large(where, name, f"{image.width} x {image.height} pixels"))
+                raise DataError(_too_large(where, name, f"{image.width * image.height} pixels"))
             if image.mode.startswith(_WIDE):
                 raise DataError(
                     f"{where}: {name} has more than 8 bits a channel (mode {image.mode!r}); save it with 8, scaled to the range that matters"
