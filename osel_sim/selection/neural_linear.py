@@ -51,7 +51,7 @@ class NeuralLinearSelector(BayesianSelector):
             raise UsageError(f"components and hidden must be at least 1, got {components} and {hidden}")
         self._own = {"components": components, "hidden": hidden}
         self._hidden = HiddenLayer(components, hidden)
-        prior = Prior(signals, chance=chance, mean_chance=chance, expected_costs=expected_costs, warm_contexts=warm_contexts)
+        prior = Prior(signals, chance=chance, mean_chance=1.0, expected_costs=expected_costs, warm_contexts=warm_contexts)
         super().__init__(policies, context_dim, seed, self._hidden, prior)
 
     @property
