@@ -19,8 +19,8 @@ class TunedPPOSelector(PPOSelector):
     sees the leading principal components of the contexts so far, half whitened. The numbers were chosen on synthetic streams and on the choosing
     half of `assets/logs/suite`.
 
-    It may stay with a worse policy for good, as PPO may: a softmax that has become sure of an action hardly draws another, the clipped objective takes
-    small steps back, and nothing in the published form makes it try.
+    It may stay with a worse policy for good, as PPO may: a softmax that has become sure of an action hardly draws another, the clipped objective
+    takes small steps back, and nothing in the published form makes it try.
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
