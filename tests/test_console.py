@@ -29,7 +29,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> str:
 @pytest.mark.parametrize("make", CONSOLES, ids=["ours", "theirs"])
 def test_names_are_no_markup(capsys: pytest.CaptureFixture[str], make) -> None:
     part = {"decisions": 1, "mean_reward": 0.5, "success_rate": 0.5, "success_interval": [0.1, 0.9], "mean_steps": 1.0, "mean_seconds": 1.0}
-    part |= {"price": 0.0, "fallbacks": 0, "errors": 0}
+    part |= {"price": 0.0, "fallbacks": 0, "solved_by_fallback": 0, "errors": 0}
     summary = {"task": "[/bold] t", "selector": "[/red] s", **part, "policies": dict.fromkeys(NAMES, part)}
     summary |= {"regret": 0.1, "hindsight_oracle": 0.9, "always": dict.fromkeys(NAMES, 0.5), "best_single_policy": NAMES[0]}
     make().print(run_table(summary))
@@ -55,9 +55,9 @@ def test_names_of_a_replay_are_no_markup(capsys: pytest.CaptureFixture[str], mak
         "log": {"tasks": NAMES, "instances": 1, "left_out": {"instances": 1}},
         "decisions": 1,
         "seeds": [0],
-        "learnable_oracle": {"name": "expected"},
+        "learnable_oracle": {"name": "expected", "beaten": {"per_task": NAMES[0]}},
         "selectors": {**dict.fromkeys(NAMES, entry), "best_single": entry | {"policy": NAMES[0]}},
-        "oracles": {"expected": entry},
+        "oracles": {"expected": entry | {"gain": 0.1, "gain_ci95": [0.0, 0.2]}},
         "verdict": {"text": f"Do not route: always use {NAMES[2]}."},
     }
     print_replay(make(), result)

@@ -143,7 +143,8 @@ def made(contexts: np.ndarray, generator: np.random.Generator, rates: np.ndarray
     names = tuple(f"p{column}" for column in range(policies))
     measures = dict.fromkeys(("subgoals", "score", "steps", "upload", "inference", "download", "motion", "price"), nothing)
     context = contexts.astype(np.float32)
-    return LoggedOutcomes(Path("made"), instances, names, context, "made@1", success, **measures, errors=np.zeros(success.shape, bool), metadata={})
+    flags = {name: np.zeros(success.shape, bool) for name in ("errors", "fallbacks", "solved_by_fallback")}
+    return LoggedOutcomes(Path("made"), instances, names, context, "made@1", success, **measures, **flags, metadata={})
 
 
 def test_only_complete_instances_are_streamed(tmp_path: Path):

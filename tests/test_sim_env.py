@@ -252,7 +252,8 @@ def test_memory_does_not_grow_over_resets(env):
 def test_renders_with_either_backend_even_when_mujoco_was_imported_first(backend):
     code = "import mujoco\nfrom osel_sim.sim.env import TaskEnv\nprint(TaskEnv('pick_place').image('agentview', 32, 32).std() > 10)"
     environment = {**os.environ, "MUJOCO_GL": backend}
-    environment.pop("OSEL_SIM_GL_CHECKED", None)
+    for ours in ("OSEL_SIM_GL_CHECKED", "PYOPENGL_PLATFORM"):
+        environment.pop(ours, None)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
     if "apt-get install" in done.stderr:
         pytest.skip(f"{backend} is not installed")
