@@ -32,10 +32,10 @@ import os
 import numpy as np
 
 from osel_sim.interface.policy import Actions, Observation
+from osel_sim.interface.specification import specification
 from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.protocol import Greeting, example_observation
 from osel_sim.remote.server import PolicyServer
-from osel_sim.sim.specification import specification
 
 GREETING = Greeting("mine", cameras=("agentview", "wrist"), image_size=96, action_dim=7, state_dim=8)
 

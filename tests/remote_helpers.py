@@ -12,10 +12,10 @@ from websockets.sync.server import ServerConnection, serve
 
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.interface.policy import Actions, Observation
+from osel_sim.interface.specification import specification
 from osel_sim.remote.codec import pack
 from osel_sim.remote.protocol import Greeting, example_observation
 from osel_sim.remote.server import PolicyServer
-from osel_sim.sim.specification import specification
 
 TOKEN = "test-token-123"
 ENVIRONMENT = specification()

@@ -25,11 +25,11 @@ from osel_sim.episodes.drivers import choose_policies
 from osel_sim.formats import library
 from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.policy_file import load_policy_file
+from osel_sim.interface.specification import specification
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.mapping import actions_of, message_of, orientation, state_of, state_size
 from osel_sim.policy.registry import session_factory
 from osel_sim.remote.policy import open_remote
-from osel_sim.sim.specification import specification
 
 SIZE = 32
 ROBOT = specification()

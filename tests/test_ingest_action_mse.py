@@ -11,8 +11,8 @@ from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.ingest import main as ingest_main
 from osel_sim.ingestion.action_mse import Measurement, action_mse, measure_one, open_datasets
+from osel_sim.interface.specification import specification
 from osel_sim.policy.local import LocalCaller
-from osel_sim.sim.specification import specification
 
 EPISODES = 2
 

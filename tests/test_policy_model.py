@@ -18,11 +18,11 @@ from osel_sim.core.errors import CheckpointError
 from osel_sim.core.torch_settings import threads
 from osel_sim.formats import library
 from osel_sim.formats.conventions import Conventions
+from osel_sim.interface.specification import specification
 from osel_sim.policy.language_chunk import LanguageChunkConfig, LanguageChunkPolicy, make_language_chunk_pre_post_processors
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.processing import area_weights, rotation_columns
 from osel_sim.policy.text import PADDING, embed, tokenise
-from osel_sim.sim.specification import specification
 from osel_sim.training.recipe import find_recipe, load_recipe
 
 ROBOT = specification()

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from remote_helpers import observation, policy_spec
 
+from osel_sim.interface.specification import specification
 from osel_sim.policy.registry import session_factory
 from osel_sim.remote.policy import open_remote
-from osel_sim.sim.specification import specification
 
 pytestmark = pytest.mark.slow  # each process imports LeRobot
 

@@ -8,12 +8,12 @@ import pytest
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.episodes.expected_costs import expected_costs
 from osel_sim.formats.policy_file import PolicySpec, Price, Remote
+from osel_sim.interface.specification import specification
 from osel_sim.selection.features import Components, Landmarks, Sketch
 from osel_sim.selection.kernel_ucb import KernelUCBSelector
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.selection.state import load_state, save_state
-from osel_sim.sim.specification import specification
 
 POLICIES = ("a", "b", "c")
 CONTEXTUAL = ("linucb", "lints", "neural_linear", "auto")

@@ -19,10 +19,10 @@ from osel_sim.core.shown import all_shown, printable, shown
 from osel_sim.formats.journal import to_line
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.interface.outcome import Outcome, Seconds
+from osel_sim.interface.specification import specification
 from osel_sim.remote.client import RemoteClient
 from osel_sim.reporting.page import Page, Section, Verdict, to_html
 from osel_sim.run import main as run_main
-from osel_sim.sim.specification import specification
 
 HOSTILE = "a\x1b[2J\x1b]0;title\x07b\x9b31mc\x08\x7fd\rfake\u202eEVIL\u2066\u2028\x00\U000e0041"
 RAW = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\u2028\u2029\U000e0000-\U000e007f]")

@@ -24,12 +24,12 @@ from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.formats.rollout_log import DECLARED, read_rollouts
 from osel_sim.interface.call import Call
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
+from osel_sim.interface.specification import specification
 from osel_sim.interface.suite import Task
 from osel_sim.policy.environment_fit import misfits
 from osel_sim.policy.registry import session_factory
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
-from osel_sim.sim.specification import specification
 from osel_sim.suites.base import BaseEnvironment
 from osel_sim.suites.check import SuiteError, check_task
 from osel_sim.suites.registry import common_specification, find_task, known_axes, select_tasks

@@ -14,9 +14,9 @@ from safetensors.torch import load_file
 
 from osel_sim.core.errors import CheckpointError, ContentError, DataError, UnknownNameError, UsageError
 from osel_sim.formats import library
+from osel_sim.interface.specification import specification
 from osel_sim.policy import register
 from osel_sim.policy.lerobot_policy import load
-from osel_sim.sim.specification import specification
 from osel_sim.training.annotations import load_annotations
 from osel_sim.training.batches import Batches, frames_of, statistics_of
 from osel_sim.training.dataset import load_demonstrations

@@ -19,10 +19,10 @@ from osel_sim.core import content
 from osel_sim.core.errors import CheckpointError, UsageError
 from osel_sim.core.trust import VARIABLE, ForeignCodeError, trust, trusted, trusting
 from osel_sim.formats import library
+from osel_sim.interface.specification import specification
 from osel_sim.policy import register
 from osel_sim.policy.lerobot_policy import load
 from osel_sim.policy.trust import check_checkpoint
-from osel_sim.sim.specification import specification
 from osel_sim.training.initial import Initial
 
 ROBOT = specification()

@@ -220,7 +220,7 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.formats.dataset_mapping import load_dataset_mapping
     from osel_sim.ingestion.action_mse import Measurement, measure_errors, open_datasets
     from osel_sim.ingestion.write import check_out, write_log
-    from osel_sim.sim.specification import specification
+    from osel_sim.interface.specification import specification
 
     start = time.perf_counter()
     if not config.dataset:

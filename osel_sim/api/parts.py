@@ -57,8 +57,8 @@ def load_policy(name: str, *, task: str | None = None, policies_dir: Path | str 
         CheckpointError: its checkpoint is missing, unreadable or does not fit its file.
     """
     from osel_sim.formats import library
+    from osel_sim.interface.specification import specification
     from osel_sim.policy.registry import make_policy
-    from osel_sim.sim.specification import specification
     from osel_sim.suites.registry import find_task
 
     environment = specification() if task is None else find_task(task).specification

@@ -121,6 +121,6 @@ def _environment(config: ServeConfig) -> "EnvironmentSpec":
         from osel_sim.suites.registry import find_task
 
         return find_task(config.task).specification
-    from osel_sim.sim.specification import specification
+    from osel_sim.interface.specification import specification
 
     return specification()

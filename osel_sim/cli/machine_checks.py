@@ -204,8 +204,8 @@ def _suites() -> Iterator[Check]:
 
 
 def _policies(folder: Path | None) -> Iterator[Check]:
+    from osel_sim.interface.specification import specification
     from osel_sim.policy.environment_fit import misfits
-    from osel_sim.sim.specification import specification
 
     found = content.files("policies", folder)
     if not found:

@@ -26,7 +26,7 @@ from osel_sim.ingestion.lerobot_numbers import actions, check_mapping, states
 from osel_sim.ingestion.write import IngestedInstance
 from osel_sim.interface.encoder import Image
 from osel_sim.interface.policy import Observation
-from osel_sim.sim.specification import specification
+from osel_sim.interface.specification import specification
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from osel_sim.core.errors import ContentError, DataError
 from osel_sim.formats.dataset_mapping import DatasetMapping
 from osel_sim.ingestion.lerobot_files import DatasetFiles
+from osel_sim.interface.specification import ACTION, ACTION_DIM, STATE, STATE_DIM
 from osel_sim.policy.mapping import actions_of
-from osel_sim.sim.specification import ACTION, ACTION_DIM, STATE, STATE_DIM
 
 logger = logging.getLogger(__name__)
 

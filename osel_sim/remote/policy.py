@@ -10,6 +10,7 @@ from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.call import Call
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Observation
+from osel_sim.interface.specification import specification
 from osel_sim.policy.environment_fit import check_environment
 from osel_sim.policy.mapping import message_of
 from osel_sim.remote.client import Answer, HungUpError, NoAnswerError, RemoteClient, UnsentError
@@ -126,13 +127,15 @@ class RemotePolicy:
         return str(error).removeprefix(f"{self._client.url}: ")
 
 
-def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float | None = None, start_timeout: float = 120.0) -> RemotePolicy:
+def open_remote(
+    spec: PolicySpec, environment: EnvironmentSpec | None = None, timeout: float | None = None, start_timeout: float = 120.0
+) -> RemotePolicy:
     """A remote policy ready for use: connects to the `url` of its file, with the token in OSEL_SIM_TOKEN, or starts a server of its own.
 
     Close it after use.
 
     Args:
-        environment: what it will drive.
+        environment: what it will drive; None: one of ours.
         timeout: real seconds for one answer; None: as the policy file says.
         start_timeout: real seconds for a server to load its weights, or for one that is not ours to answer its first request; never less than
             for any other.
@@ -143,6 +146,7 @@ def open_remote(spec: PolicySpec, environment: EnvironmentSpec, timeout: float |
     """
     if spec.remote is None:
         raise UsageError(f"{spec.file}: is not a remote policy")
+    environment = environment or specification()
     check_environment(spec, environment)
     timeout = spec.remote.timeout if timeout is None else timeout
     start_timeout = max(start_timeout, timeout)

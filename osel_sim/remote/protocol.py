@@ -17,6 +17,7 @@ from osel_sim.core.shown import TOKEN_VARIABLE as TOKEN_VARIABLE  # where others
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.policy import Observation
+from osel_sim.interface.specification import specification
 from osel_sim.remote.codec import ProtocolError
 
 PROTOCOL = "osel_sim/1"
@@ -50,8 +51,9 @@ class Greeting:
     action: ActionSpec | None = field(default=None, compare=False, repr=False)
 
     @classmethod
-    def of(cls, spec: PolicySpec, environment: EnvironmentSpec) -> "Greeting":
-        """The greeting of the server of one policy file, which drives in an environment."""
+    def of(cls, spec: PolicySpec, environment: EnvironmentSpec | None = None) -> "Greeting":
+        """The greeting of the server of one policy file, which drives in an environment; None: one of ours."""
+        environment = environment or specification()
         return cls(spec.name, spec.cameras, spec.image_size, environment.action.dimension, environment.state_size, environment.action)
 
     def to_dict(self) -> dict[str, Any]:

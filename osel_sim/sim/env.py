@@ -13,11 +13,11 @@ from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Observation
+from osel_sim.interface.specification import ACTION, ACTION_DIM, CONTROL_HZ, STATE_DIM, specification
 from osel_sim.sim import predicates
 from osel_sim.sim.cameras import LARGEST
 from osel_sim.sim.instance import Instance, make_instance
 from osel_sim.sim.robots import with_robot
-from osel_sim.sim.specification import ACTION, ACTION_DIM, CONTROL_HZ, STATE_DIM, specification
 from osel_sim.sim.world import Snapshot, World
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from osel_sim.formats.levels import AXES, LEVELS
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.instance import SPLITS
+from osel_sim.interface.specification import specification
 from osel_sim.interface.suite import OURS, SuiteSpec, TaskInfo
 from osel_sim.sim.robots import load_robot, with_robot
-from osel_sim.sim.specification import specification
 
 if TYPE_CHECKING:
     from osel_sim.sim.env import TaskEnv

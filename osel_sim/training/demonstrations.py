@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from osel_sim.core.files import read_json, write_text
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.robot import DEFAULT_ROBOT
-from osel_sim.sim.specification import ACTION_DIM, CAMERAS, CONTROL_HZ, STATE_DIM
+from osel_sim.interface.specification import ACTION_DIM, CAMERAS, CONTROL_HZ, STATE_DIM
 
 BURST_PROBABILITY = 0.04
 """Chance that a burst of noise starts at a step."""

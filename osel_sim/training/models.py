@@ -16,13 +16,13 @@ from osel_sim.core.errors import UsageError
 from osel_sim.core.files import atomic_files
 from osel_sim.formats.dataset_mapping import IMAGES
 from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.specification import ACTION_DIM, STATE_DIM
 from osel_sim.policy import register
 from osel_sim.policy.language_chunk import LanguageChunkConfig
 from osel_sim.policy.perception import Perception, PerceptionConfig, percept_size
 from osel_sim.policy.perception_step import PerceptionStep
 from osel_sim.policy.processing import HashedTextStep, ImageSizeStep, RotationStep
 from osel_sim.policy.scene import LABELS
-from osel_sim.sim.specification import ACTION_DIM, STATE_DIM
 from osel_sim.training.act import LabelWeights, PerceivingACT
 from osel_sim.training.batches import Statistics
 from osel_sim.training.dataset import Demonstrations

@@ -14,7 +14,7 @@ from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic
 from osel_sim.core.progress import progress
 from osel_sim.formats.task_file import TaskSpec
-from osel_sim.sim.specification import CONTEXT_CAMERA as CAMERA
+from osel_sim.interface.specification import CONTEXT_CAMERA as CAMERA
 
 
 @dataclass(frozen=True)
