@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from annotated_types import Ge, Gt, Le, Lt, MinLen
+from annotated_types import Ge, Le, MinLen
 from pydantic import BeforeValidator
 
 from osel_sim.api.results import CompareResult
@@ -27,13 +27,13 @@ class CompareConfig(LoggedRewardSettings):
     """rollout log, live run, or several of them; the first is what the others are compared with"""
     policies: Annotated[Names | None, MAIN] = None
     """of one log: what to compare, the first being what the others are compared with (default: all); of several: one in all, or one of each"""
-    margin: Annotated[float, Ge(0.0), Lt(1.0), MAIN] = 0.05
+    margin: Annotated[float, Ge(0.0), Le(1.0), MAIN] = 0.05
     """how much lower success may be to count as no worse; 0.05 is 5 points"""
     plan: Annotated[bool, MAIN] = False
     """say how many instances it takes to find a difference, instead of comparing"""
-    detect: Annotated[float, Gt(0.0), Le(1.0), MAIN] = 0.05
+    detect: Annotated[float, Ge(0.001), Le(1.0), MAIN] = 0.05
     """difference of success to plan for"""
-    power: Annotated[float, Gt(0.0), Lt(1.0), MAIN] = 0.8
+    power: Annotated[float, Ge(0.5), Le(0.99), MAIN] = 0.8
     """probability with which the instances that are said to be needed tell"""
     out: Annotated[Path | None, OUTPUT] = None
     """folder for compare.json (default: none is written)"""

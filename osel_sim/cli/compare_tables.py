@@ -6,10 +6,10 @@ from typing import Any
 from rich.console import Console
 
 from osel_sim.cli.console import Table, plain
-from osel_sim.reporting.comparison import Rows, difference_rows, letter_rows, notes, pair_rows, plan_rows, task_rows
+from osel_sim.reporting.comparison import Rows, difference_rows, letter_rows, losses_first, notes, pair_rows, plan_rows, task_rows
 
 FLIPS = 10
-"""Most instances that are listed; `compare.json` and Markdown have all."""
+"""Most instances that are listed; `compare.json` has all."""
 
 
 def print_compare(console: Console, result: Mapping[str, Any]) -> None:
@@ -23,8 +23,7 @@ def print_compare(console: Console, result: Mapping[str, Any]) -> None:
             console.print(_table("success by task", task_rows(entry), 1))
         for note in notes(entry):
             console.print(plain(note), soft_wrap=True)
-        losses_first = sorted(entry["flips"], key=lambda flip: float(flip["second"] - flip["first"]))
-        for flip in losses_first[:FLIPS]:
+        for flip in losses_first(entry)[:FLIPS]:
             console.print(plain(f"  {flip['instance']}: {flip['first']:.2g} -> {flip['second']:.2g}"), soft_wrap=True)
         if len(entry["flips"]) > FLIPS:
             console.print(plain(f"  and {len(entry['flips']) - FLIPS} more instances that changed: compare.json (--out) has them"))

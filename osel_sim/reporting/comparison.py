@@ -13,6 +13,10 @@ SHARES = ("success", "subgoals")
 """Measures that are told in percent, and their differences in points."""
 
 
+MARKDOWN_FLIPS = 100
+"""Most instances that are listed in Markdown: a comment on a pull request holds 65,536 characters."""
+
+
 def difference_rows(entry: Mapping[str, Any]) -> Rows:
     """What two policies came to, a row a measure."""
     rows: Rows = [("", entry["first"], entry["second"], "difference [95%]", "instances")]
@@ -76,6 +80,11 @@ def notes(entry: Mapping[str, Any]) -> list[str]:
     return found
 
 
+def losses_first(entry: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Instances whose success changed, those that the second lost before those that it gained."""
+    return sorted(entry["flips"], key=lambda flip: float(flip["second"] - flip["first"]))
+
+
 def letter_rows(result: Mapping[str, Any]) -> Rows:
     """The compact letter display: policies that share a letter were not told apart."""
     return [("policy", "letters"), *(result["letters"] or {}).items()]
@@ -100,8 +109,9 @@ def markdown(result: Mapping[str, Any]) -> str:
             parts.append(_table(task_rows(entry)))
         if entry["flips"]:
             rows: Rows = [("instance", entry["first"], entry["second"])]
-            rows += [(flip["instance"], f"{flip['first']:.2g}", f"{flip['second']:.2g}") for flip in entry["flips"]]
-            parts.append(f"<details><summary>{len(rows) - 1} instances changed</summary>\n\n{_table(rows)}\n\n</details>")
+            rows += [(flip["instance"], f"{flip['first']:.2g}", f"{flip['second']:.2g}") for flip in losses_first(entry)[:MARKDOWN_FLIPS]]
+            rest = f", of which {MARKDOWN_FLIPS} are listed" if len(entry["flips"]) > MARKDOWN_FLIPS else ""
+            parts.append(f"<details><summary>{len(entry['flips'])} instances changed{rest}</summary>\n\n{_table(rows)}\n\n</details>")
     return "\n\n".join(parts) + "\n"
 
 
