@@ -224,7 +224,7 @@ def made_up(generator: np.random.Generator, pairs: int, gained: float, lost: flo
 def test_claims_are_wrong_as_rarely_as_promised():
     from osel_sim.analysis.comparison import _probability
 
-    def decisions(pairs: int, gained: float, lost: float, comparisons: int = 800) -> dict[str, float]:
+    def decisions(pairs: int, gained: float, lost: float, comparisons: int = 500) -> dict[str, float]:
         generator = np.random.default_rng([pairs, int(1000 * lost)])
         found = []
         for _ in range(comparisons):
@@ -232,7 +232,7 @@ def test_claims_are_wrong_as_rarely_as_promised():
             found.append(_verdict(sample, _probability(sample), 1, 0.05, 0.8)["decision"])
         return {name: found.count(name) / comparisons for name in ("better", "worse", "no worse", "not enough data")}
 
-    slack = 2 * np.sqrt(0.025 * 0.975 / 800)
+    slack = 2 * np.sqrt(0.025 * 0.975 / 500)
     for pairs in (25, 100, 400):
         equal = decisions(pairs, 0.1, 0.1)
         assert equal["better"] <= 0.025 + slack and equal["worse"] <= 0.025 + slack

@@ -117,7 +117,7 @@ def test_mean_interval_is_students():
     values = np.random.default_rng(5).exponential(size=25) - 0.7
     expected = ttest_1samp(values, 0.0).confidence_interval()
     assert mean_interval(values) == pytest.approx((expected.low, expected.high))
-    assert mean_interval([1.0]) is None
+    assert mean_interval([1.0]) is None and mean_interval([0.5] * 9) is None
 
 
 def test_holm_by_hand():

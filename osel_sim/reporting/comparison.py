@@ -62,9 +62,9 @@ def plan_rows(result: Mapping[str, Any]) -> Rows:
 def notes(entry: Mapping[str, Any]) -> list[str]:
     """What is to be known of a pair of policies beside its tables."""
     first, second, test, unpaired = entry["first"], entry["second"], entry["test"], entry["unpaired"]
-    more = f"; {entry['pairs_of_repeats']} pairs of repeats" if entry["pairs_of_repeats"] > entry["instances"] else ""
+    more = f", of repeats: {entry['pairs_of_repeats']}" if entry["pairs_of_repeats"] > entry["instances"] else ""
     found = [
-        f"{entry['instances']} pairs of instances{more}. {second} is higher on {test['gained']} and lower on {test['lost']} "
+        f"Pairs of instances: {entry['instances']}{more}. {second} is higher on {test['gained']} and lower on {test['lost']} "
         f"({test['method']}: p {probability(test['p'], sign=True)})."
     ]
     if unpaired["first"] or unpaired["second"]:

@@ -120,9 +120,9 @@ def success_interval(differences: ArrayLike, confidence: float = 0.95, most: flo
 
 
 def mean_interval(differences: ArrayLike, confidence: float = 0.95) -> Interval | None:
-    """Student's interval of the mean of paired differences; None of fewer than two, which say nothing of how they vary."""
+    """Student's interval of the mean of paired differences; None of fewer than two or of equal ones, which say nothing of how they vary."""
     values = _checked(differences)
-    if len(values) < 2:
+    if len(values) < 2 or values.min() == values.max():
         return None
     from scipy.stats import t
 
