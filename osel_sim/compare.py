@@ -23,6 +23,7 @@ def _execute(config: CompareConfig) -> int:
     from osel_sim.api.compare import compare
     from osel_sim.cli.compare_tables import print_compare, print_plan
     from osel_sim.cli.console import console
+    from osel_sim.cli.next_step import print_next
 
     found = compare(config)
     if config.plan:
@@ -32,6 +33,11 @@ def _execute(config: CompareConfig) -> int:
     for file in (found.file, config.markdown, config.junit):
         if file is not None:
             print(f"written to {file}")
+    if config.plan or found.decision != "not enough data":
+        print_next(("makes a page of the log", "report", [config.logs[-1], "--open"]))
+    else:
+        policies = ["--policies", *config.policies] if config.policies else []
+        print_next(("says how many instances it takes", "compare", [*config.logs, *policies, "--plan", "--detect", f"{config.detect:g}"]))
     return found.exit_code
 
 

@@ -66,7 +66,7 @@ def test_the_verdict_and_what_ci_is_told(tmp_path, capsys, cells, decision, code
     assert (entry["verdict"]["more"] is not None) == (decision == "not enough data")
     shown = " ".join(capsys.readouterr().out.split())
     assert " ".join(result["verdict"]["text"].split()) in shown
-    assert ("more instances would tell" in shown) == (decision == "not enough data")
+    assert ("more instances would tell" in shown) == (decision == "not enough data") == ("--plan" in shown)
 
 
 def test_a_wider_margin_forgives_and_equal_policies_cannot_be_told_with_none(tmp_path):
