@@ -196,6 +196,8 @@ def test_wrong_settings_are_named(tmp_path):
     for call, kind, message in (
         (lambda: osel.compare(one), UsageError, "one policy, mine, is compared with nothing"),
         (lambda: osel.compare(one, one), UsageError, "given twice"),
+        (lambda: osel.compare(one, one / ".." / one.name), UsageError, "mine of .* is given twice"),
+        (lambda: osel.compare(one, other, detect=0.1), UsageError, "--detect is what --plan plans for"),
         (lambda: osel.compare(one, both), UsageError, "both has several policies, mine, yours: name one with --policies"),
         (lambda: osel.compare(one, other, policies=["a", "b", "c"]), UsageError, "2 logs need one name for all, or one each"),
         (lambda: osel.compare(one, other, policies="mime"), UnknownNameError, "did you mean 'mine'"),

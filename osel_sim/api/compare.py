@@ -62,6 +62,10 @@ def compare(*logs: "Path | str | CompareConfig", **values: Any) -> CompareResult
     from osel_sim.reporting.comparison import junit, markdown
 
     config = _configuration(logs, values)
+    if "detect" in config.given and not config.plan:
+        raise UsageError("--detect is what --plan plans for; add --plan, or leave it out")
+    if config.plan and (config.markdown is not None or config.junit is not None):
+        raise UsageError("--plan compares nothing, so there is no --markdown or --junit of it")
     if config.out is not None:
         check_compare_folder(config.out, config.overwrite)
     for flag, file in (("--markdown", config.markdown), ("--junit", config.junit)):
@@ -70,8 +74,6 @@ def compare(*logs: "Path | str | CompareConfig", **values: Any) -> CompareResult
     contenders = _contenders(config)
     weights, _ = weights_of(config, contenders[0].log.metadata)
     if config.plan:
-        if config.markdown is not None or config.junit is not None:
-            raise UsageError("--plan compares nothing, so there is no --markdown or --junit of it")
         result: dict[str, Any] = {"plan": plan(contenders, weights, config.detect, config.margin, config.power)}
     else:
         result = compared(contenders, weights, config.margin, config.power)
@@ -117,7 +119,7 @@ def _contenders(config: CompareConfig) -> "list[Contender]":
     for name, log in zip(chosen, logs, strict=True):
         log.only([name])
     names = [name if chosen.count(name) == 1 else f"{name}@{log.source}" for name, log in zip(chosen, logs, strict=True)]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise UsageError(f"{twice} is given twice: it is not compared with itself")
+    places = [(log.source.resolve(), name) for name, log in zip(chosen, logs, strict=True)]
+    if twice := next((place for place in places if places.count(place) > 1), None):
+        raise UsageError(f"{twice[1]} of {twice[0]} is given twice: it is not compared with itself")
     return [Contender(*parts) for parts in zip(names, chosen, logs, strict=True)]
