@@ -13,7 +13,6 @@ from osel_sim.selection.reward import RewardWeights
 from osel_sim.statistics.paired import Discordance, holm, letters, mean_interval, sign_flip_midp, success_interval
 
 Decision = Literal["better", "worse", "no worse", "not enough data"]
-SCHEMA_VERSION = 1
 ERROR = 0.05
 """Probability of telling policies apart that are equally good, all pairs together."""
 FEWEST = 10
