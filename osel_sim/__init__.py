@@ -19,6 +19,7 @@ from osel_sim.core import this_python
 
 if TYPE_CHECKING:
     from osel_sim.api.collect import CollectConfig, collect
+    from osel_sim.api.compare import CompareConfig, compare
     from osel_sim.api.ingest import IngestConfig, ingest
     from osel_sim.api.parts import load_log, load_policy, make_env, make_selector
     from osel_sim.api.record import RecordConfig, record
@@ -34,6 +35,7 @@ if getattr(sys, "argv", [])[:1] == ["-m"]:  # what it is while `python -m osel_s
 
 _PLACES = {
     "CollectConfig": "api.collect",
+    "CompareConfig": "api.compare",
     "IngestConfig": "api.ingest",
     "OselError": "core.errors",
     "RecordConfig": "api.record",
@@ -43,6 +45,7 @@ _PLACES = {
     "SelectorBase": "selection.base",
     "as_policy": "policy.objects",
     "collect": "api.collect",
+    "compare": "api.compare",
     "ingest": "api.ingest",
     "load_log": "api.parts",
     "load_policy": "api.parts",
@@ -56,6 +59,7 @@ _PLACES = {
 
 __all__ = [
     "CollectConfig",
+    "CompareConfig",
     "IngestConfig",
     "OselError",
     "RecordConfig",
@@ -65,6 +69,7 @@ __all__ = [
     "SelectorBase",
     "as_policy",
     "collect",
+    "compare",
     "ingest",
     "load_log",
     "load_policy",

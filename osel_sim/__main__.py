@@ -10,6 +10,7 @@ COMMANDS = {
     "run": "let a selector choose live which policy handles each instance",
     "record": "run every policy on the same instances: a rollout log",
     "replay": "show a log to selectors: is routing worth it?",
+    "compare": "did a policy get worse? paired differences and a verdict",
     "report": "one page about a run, a replay or a log",
     "ingest": "turn outcome tables of others into a log",
     "collect": "demonstrations of the scripted expert",

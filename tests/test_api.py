@@ -46,7 +46,7 @@ def log(tmp_path_factory) -> Path:
 
 
 def test_functions_stay_functions_when_the_commands_are_imported():
-    for name in ("run", "record", "replay", "report", "ingest", "collect"):
+    for name in ("run", "record", "replay", "report", "ingest", "collect", "compare"):
         assert callable(import_module(f"osel_sim.{name}").main)
         assert getattr(osel, name).__module__ == f"osel_sim.api.{name}"
     assert set(osel.__all__) <= set(dir(osel))

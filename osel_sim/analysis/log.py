@@ -215,6 +215,18 @@ def read_log(folder: Path, encoder: str | None = None) -> LoggedOutcomes:
     return _logged(folder, rows, metadata, identity, contexts, read_skills(folder, identity, metadata.get(DECLARED)))
 
 
+def read_outcomes(folder: Path) -> LoggedOutcomes:
+    """Read a rollout log without its contexts, which need not be there; they are (N, 0), of no encoder.
+
+    Raises:
+        DataError: as `read_log`.
+    """
+    rows, metadata = read_rollouts(folder)
+    if not rows:
+        raise DataError(f"{folder / ROLLOUTS}: the log has no rows")
+    return _logged(folder, rows, metadata, "", np.zeros((len({row.instance for row in rows}), 0), np.float32), None)
+
+
 def read_unfinished(folder: Path) -> tuple[LoggedOutcomes, list[Row]]:
     """What a recording that goes on, or was killed, has so far, and its rows; nothing in the folder is touched.
 

@@ -125,3 +125,79 @@ class ReplayResult:
         from osel_sim.analysis.result import tables
 
         return frame(tables(cast(dict[str, Any], self.result))[name] if self.result else [])
+
+
+@dataclass(frozen=True)
+class CompareResult:
+    """What came of a comparison.
+
+    Attributes:
+        folder: where `compare.json` is; None where none was asked for.
+        result: as `compare.json` has it.
+    """
+
+    folder: Path | None
+    result: Mapping[str, Any]
+
+    @property
+    def file(self) -> Path | None:
+        """`compare.json`."""
+        from osel_sim.formats.compare_result import COMPARE
+
+        return None if self.folder is None else self.folder / COMPARE
+
+    @property
+    def decision(self) -> str:
+        """`better`, `worse`, `no worse` or `not enough data`; empty of a plan. Of several policies that of the first that is found in the order
+        worse, not enough data, no worse, better."""
+        return str(self.result["verdict"]["decision"]) if "verdict" in self.result else ""
+
+    @property
+    def verdict(self) -> str:
+        """Did it get worse? In words; empty of a plan."""
+        return str(self.result["verdict"]["text"]) if "verdict" in self.result else ""
+
+    @property
+    def exit_code(self) -> int:
+        """Of the command: 0 no worse, or a plan; 1 worse; 3 not enough data."""
+        return int(self.result["verdict"]["exit_code"]) if "verdict" in self.result else 0
+
+    @cached_property
+    def differences(self) -> "pandas.DataFrame":
+        """A row a pair of policies and measure: both means, the difference with its interval."""
+        return frame(
+            {"first": pair["first"], "second": pair["second"], "measure": name, **_means(found)}
+            for pair in self.result.get("pairs", ())
+            for name, found in pair["differences"].items()
+        )
+
+    @cached_property
+    def tasks(self) -> "pandas.DataFrame":
+        """A row a pair of policies and task: the difference of success, with its p corrected over the tasks."""
+        return frame(
+            {"first": pair["first"], "second": pair["second"], "task": name, **_means(found)}
+            for pair in self.result.get("pairs", ())
+            for name, found in pair["tasks"].items()
+        )
+
+    @cached_property
+    def flips(self) -> "pandas.DataFrame":
+        """A row a pair of policies and instance whose success is not the same."""
+        return frame(
+            {"first": pair["first"], "second": pair["second"], "instance": flip["instance"], "task": flip["task"]}
+            | {f"success_{side}": flip[side] for side in ("first", "second")}
+            for pair in self.result.get("pairs", ())
+            for flip in pair["flips"]
+        )
+
+    @property
+    def plan(self) -> "pandas.DataFrame":
+        """A row a pair of policies: instances needed. Empty of a comparison."""
+        return frame(self.result.get("plan", ()))
+
+
+def _means(found: Mapping[str, Any]) -> dict[str, Any]:
+    """An entry of a comparison, whose `first` and `second` are means, as columns."""
+    low, high = found["ci95"] or (None, None)
+    rest = {name: value for name, value in found.items() if name not in ("first", "second", "ci95")}
+    return {"mean_first": found["first"], "mean_second": found["second"], **rest, "low": low, "high": high}

@@ -1,0 +1,153 @@
+"""Policies side by side on the same instances: what each came to where both have a valid outcome, and what has no counterpart."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from osel_sim.analysis.live import is_live_run, read_live
+from osel_sim.analysis.log import Array, LoggedInstance, LoggedOutcomes, mean_over_repeats, read_outcomes
+from osel_sim.core.errors import DataError
+from osel_sim.formats.toml_types import quoted
+from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.selection.reward import RewardWeights
+
+MEASURES = ("success", "subgoals", "score", "reward", "steps", "seconds", "price")
+"""What is compared, where a log has it; price in cents."""
+_ABOUT = ("task", "instruction", "phrasing", "target", "container", "seed", "level", "split")
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One policy of one log.
+
+    Attributes:
+        name: what it is called beside the others; with the log's folder where two have the same policy.
+        policy: its name in the log.
+    """
+
+    name: str
+    policy: str
+    log: LoggedOutcomes
+
+    def values(self, weights: RewardWeights) -> tuple[dict[str, Array], dict[str, str]]:
+        """Each measure as its mean over repeats, (N,), NaN where there is none; and why the reward is missing, if it is."""
+        log, missing = self.log.only([self.policy]), dict[str, str]()
+        tables = {name: log.seconds if name == "seconds" else getattr(log, name) for name in MEASURES if name != "reward"}
+        try:
+            tables["reward"] = log.rewards(weights)
+        except DataError as error:
+            missing["reward"] = str(error)
+        return {name: mean_over_repeats(table)[:, 0] for name, table in tables.items()}, missing
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Two contenders on the n instances on which both have a valid outcome.
+
+    Attributes:
+        keys, tasks: (n,) of the instances, in the order of the first's log.
+        first_values, second_values: measure -> (n,) mean over an instance's repeats; NaN where unknown.
+        repeats: pairs of repeats, n where nothing was repeated.
+        only_first, only_second: instances on which only that one has a valid outcome.
+        errors: episodes of either that ended in error, on whatever instance.
+        missing: measure -> why there is none.
+    """
+
+    first: Contender
+    second: Contender
+    keys: tuple[str, ...]
+    tasks: tuple[str, ...]
+    first_values: Mapping[str, Array]
+    second_values: Mapping[str, Array]
+    repeats: int
+    only_first: int
+    only_second: int
+    errors: tuple[int, int]
+    missing: Mapping[str, str]
+
+    def differences(self, measure: str = "success") -> Array:
+        """The second's value minus the first's, (n,); NaN where one is unknown."""
+        return self.second_values[measure] - self.first_values[measure]
+
+
+def read_contender_log(folder: Path) -> LoggedOutcomes:
+    """A rollout log, of which contexts are not needed, or a live run: what it chose, and with `--counterfactual` all outcomes."""
+    return read_live(folder).outcomes if is_live_run(folder) else read_outcomes(folder)
+
+
+def pair(first: Contender, second: Contender, weights: RewardWeights) -> Pairs:
+    """Pair two contenders by the instances' keys.
+
+    Raises:
+        DataError: no instance has a valid outcome of both, or the logs tell different things of an instance, its task file or the noise.
+    """
+    if first.log is not second.log:
+        _check_same_conditions(first.log, second.log)
+    (values_first, missing_first), (values_second, missing_second) = first.values(weights), second.values(weights)
+    values = values_first, values_second
+    at = [
+        {key: row for row, key in enumerate(one.log.keys) if np.isfinite(own["success"][row])}
+        for one, own in zip((first, second), values, strict=True)
+    ]
+    keys = [key for key in at[0] if key in at[1]]
+    if not keys:
+        raise DataError(
+            f"{first.name} and {second.name} have no instance in common on which both have an outcome, so nothing can be paired: "
+            f"{_some(first, at[0])}; {_some(second, at[1])}. Record both with the same tasks, levels, split and seeds"
+        )
+    rows = [[positions[key] for key in keys] for positions in at]
+    if first.log is not second.log:
+        for key, one, other in zip(keys, *rows, strict=True):
+            _check_same_instance(key, (first.log, one), (second.log, other))
+    counts = [np.isfinite(one.log.only([one.policy]).success[own, 0]).sum(axis=1) for one, own in zip((first, second), rows, strict=True)]
+    known = [name for name in MEASURES if all(name in own for own in values)]
+    return Pairs(
+        first,
+        second,
+        tuple(keys),
+        tuple(first.log.instances[row].task for row in rows[0]),
+        {name: values[0][name][rows[0]] for name in known},
+        {name: values[1][name][rows[1]] for name in known},
+        int(np.minimum(*counts).sum()),
+        len(at[0]) - len(keys),
+        len(at[1]) - len(keys),
+        (_errors(first), _errors(second)),
+        missing_first | missing_second,
+    )
+
+
+def _errors(contender: Contender) -> int:
+    return int(contender.log.only([contender.policy]).errors.sum())
+
+
+def _some(contender: Contender, keys: Mapping[str, int]) -> str:
+    return f"{contender.name} has {len(keys)}" + (f", such as {quoted(next(iter(keys)))}" if keys else "")
+
+
+def _check_same_conditions(one: LoggedOutcomes, other: LoggedOutcomes) -> None:
+    """Refuse logs whose scenes or actions were made differently, as far as their metadata say."""
+    contents = [log.metadata.get("content") or {} for log in (one, other)]
+    for name in sorted(set(contents[0]) & set(contents[1])):
+        if name.startswith("task ") and contents[0][name] != contents[1][name]:
+            raise DataError(f"{name} is another file in {other.source} than in {one.source}: scenes of one seed may differ, so they are no pairs")
+    noises = [log.metadata.get("action_noise") for log in (one, other)]
+    if None not in noises and noises[0] != noises[1]:
+        raise DataError(f"action_noise is {noises[0]} in {one.source} and {noises[1]} in {other.source}: record both with the same --action-noise")
+
+
+def _check_same_instance(key: str, one: tuple[LoggedOutcomes, int], other: tuple[LoggedOutcomes, int]) -> None:
+    """Refuse a pair of which the logs tell different things; what one of them does not know does not count."""
+    here, there = (log.instances[row] for log, row in (one, other))
+    for name in (*_ABOUT, "robot"):
+        was, now = _told(here, name), _told(there, name)
+        if was is not None and now is not None and was != now:
+            there_is, here_is = (f"{quoted(value)} in {log.source}" for value, (log, _) in ((now, other), (was, one)))
+            raise DataError(f"instance {quoted(key)} is not the same in both logs: its {name} is {here_is}, {there_is}")
+
+
+def _told(instance: LoggedInstance, name: str) -> Any:
+    value = getattr(instance, name)
+    return DEFAULT_ROBOT if name == "robot" and value is None and instance.seed is not None else value

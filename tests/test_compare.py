@@ -1,0 +1,255 @@
+"""Comparing policies: pairing, what is claimed of it, what is written, and what CI is told."""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from synthetic_log import make_row
+
+import osel_sim as osel
+from osel_sim.__main__ import main
+from osel_sim.analysis.comparison import _verdict
+from osel_sim.analysis.pairing import Contender, Pairs
+from osel_sim.core.errors import DataError, SettingError, UnknownNameError, UsageError
+from osel_sim.formats.rollout_log import Row, write_rollouts
+
+
+def rows_of(policy: str, successes: Iterable[object], task: str = "lift", first: int = 0, repeat: int = 0, **values) -> list[Row]:
+    return [
+        make_row(f"{task}/test/0/{seed}", policy, repeat, bool(success), task=task, seed=seed, level=0, **values)
+        for seed, success in enumerate(successes, first)
+    ]
+
+
+def log_of(folder: Path, rows: list[Row], **metadata) -> Path:
+    folder.mkdir(parents=True)
+    write_rollouts(folder, rows, metadata)
+    return folder
+
+
+def pattern(both: int, lost: int, gained: int, neither: int) -> tuple[list[bool], list[bool]]:
+    """Successes of two policies on as many instances of each kind."""
+    first = [True] * (both + lost) + [False] * (gained + neither)
+    second = [True] * both + [False] * lost + [True] * gained + [False] * neither
+    return first, second
+
+
+def two_logs(tmp_path: Path, both: int, lost: int, gained: int, neither: int) -> list[Path]:
+    before, after = pattern(both, lost, gained, neither)
+    return [log_of(tmp_path / "before", rows_of("mine", before)), log_of(tmp_path / "after", rows_of("mine", after))]
+
+
+@pytest.mark.parametrize(
+    ("cells", "decision", "code"),
+    [
+        ((60, 2, 20, 18), "better", 0),
+        ((60, 20, 2, 18), "worse", 1),
+        ((200, 3, 3, 94), "no worse", 0),
+        ((20, 4, 4, 12), "not enough data", 3),
+        ((4, 0, 5, 0), "not enough data", 3),  # a p of .03, of nine instances
+        ((900, 16, 3, 81), "no worse", 0),  # told apart, and within the margin
+    ],
+)
+def test_the_verdict_and_what_ci_is_told(tmp_path, capsys, cells, decision, code):
+    logs = two_logs(tmp_path, *cells)
+    out = tmp_path / "out"
+    assert main(["compare", *map(str, logs), "--out", str(out)]) == code
+    result = json.loads((out / "compare.json").read_text())
+    assert result["verdict"]["decision"] == decision and result["verdict"]["exit_code"] == code
+    (entry,) = result["pairs"]
+    assert entry["first"] == f"mine@{logs[0]}" and entry["test"]["method"] == "exact McNemar, mid-p"
+    assert (entry["test"]["gained"], entry["test"]["lost"], len(entry["flips"])) == (cells[2], cells[1], cells[1] + cells[2])
+    assert entry["differences"]["success"]["difference"] == pytest.approx((cells[2] - cells[1]) / sum(cells))
+    assert (entry["verdict"]["more"] is not None) == (decision == "not enough data")
+    shown = " ".join(capsys.readouterr().out.split())
+    assert " ".join(result["verdict"]["text"].split()) in shown
+    assert ("more instances would tell" in shown) == (decision == "not enough data") == ("--plan" in shown)
+
+
+def test_a_wider_margin_forgives_and_equal_policies_cannot_be_told_with_none(tmp_path):
+    logs = two_logs(tmp_path, 60, 20, 2, 18)
+    assert osel.compare(*logs, margin=0.3).decision == "no worse"
+    same = two_logs(tmp_path / "same", 10, 5, 5, 10)
+    assert "no number of instances" in osel.compare(*same, margin=0.0).verdict
+
+
+def test_what_has_no_counterpart_and_what_ended_in_error_is_left_out_and_counted(tmp_path):
+    first, second = pattern(30, 2, 2, 6)
+    broken = rows_of("mine", [False] * 3, first=40, error="the arm fell off")
+    one = log_of(tmp_path / "one", rows_of("mine", first) + rows_of("mine", [True] * 8, first=40))
+    other = log_of(tmp_path / "other", rows_of("mine", second) + broken)
+    (entry,) = osel.compare(one, other).result["pairs"]
+    assert (entry["instances"], entry["unpaired"], entry["errors"]) == (40, {"first": 8, "second": 0}, {"first": 0, "second": 3})
+    assert entry["differences"]["success"]["first"] == pytest.approx(32 / 40)
+
+
+def test_repeats_are_one_instance(tmp_path):
+    generator = np.random.default_rng(0)
+    rates = generator.random(40)
+    rows = [row for repeat in range(5) for policy in ("one", "other") for row in rows_of(policy, generator.random(40) < rates, repeat=repeat)]
+    (entry,) = osel.compare(log_of(tmp_path / "log", rows)).result["pairs"]
+    assert (entry["instances"], entry["pairs_of_repeats"]) == (40, 200)
+    assert "sign flips" in entry["test"]["method"]
+    means = [np.mean([row.success for row in rows if row.policy == name]) for name in ("one", "other")]
+    assert entry["differences"]["success"]["difference"] == pytest.approx(means[1] - means[0])
+
+
+def test_nothing_is_claimed_of_what_cannot_be_paired(tmp_path):
+    one = log_of(tmp_path / "one", rows_of("a", [True] * 20))
+    other = log_of(tmp_path / "other", rows_of("b", [False] * 20, first=20))
+    with pytest.raises(DataError, match=r"no instance in common.*a has 20, such as 'lift/test/0/0'; b has 20, such as 'lift/test/0/20'"):
+        osel.compare(one, other)
+
+
+@pytest.mark.parametrize(
+    ("values", "metadata", "message"),
+    [
+        ({"instruction": "do something else"}, {}, r"instance 'lift/test/0/0' is not the same.*instruction is 'do it'.*'do something else'"),
+        ({"target": "can"}, {}, "its target is '' in .*one, 'can' in .*other"),
+        ({}, {"content": {"task lift": "2"}}, "task lift is another file in .*other"),
+        ({}, {"action_noise": 0.1}, "action_noise is 0.0 in .*one and 0.1"),
+    ],
+)
+def test_logs_that_are_not_of_the_same_scenes_are_refused_by_name(tmp_path, values, metadata, message):
+    plain = {"content": {"task lift": "1"}, "action_noise": 0.0}
+    one = log_of(tmp_path / "one", rows_of("a", [True] * 20), **plain)
+    other = log_of(tmp_path / "other", rows_of("b", [False] * 20, **values), **plain | metadata)
+    with pytest.raises(DataError, match=message):
+        osel.compare(one, other)
+
+
+def test_a_task_that_got_worse_is_named_though_the_whole_did_not(tmp_path):
+    first, second = pattern(100, 0, 0, 0), pattern(10, 20, 0, 0)
+    rows = [
+        row
+        for column, policy in enumerate(("before", "after"))
+        for row in rows_of(policy, first[column]) + rows_of(policy, second[column], task="door") + rows_of(policy, [column] * 30, task="push")
+    ]
+    found = osel.compare(log_of(tmp_path / "log", rows), policies=["before", "after"], markdown=tmp_path / "out.md")
+    tasks = found.tasks.set_index("task")
+    assert (tasks.decision["door"], tasks.decision["push"], tasks.decision["lift"]) == ("worse", "better", None)
+    assert tasks.p_holm["door"] == pytest.approx(2 * tasks.p["door"], rel=0.6)
+    assert found.decision == "better" or "no worse" in found.decision
+    assert "Yet after is worse on door." in (tmp_path / "out.md").read_text()
+
+
+def test_all_pairs_of_several_and_their_letters(tmp_path):
+    generator = np.random.default_rng(1)
+    rows = [row for name, rate in (("a", 0.5), ("b", 0.9), ("c", 0.5), ("d", 0.1)) for row in rows_of(name, generator.random(200) < rate)]
+    found = osel.compare(log_of(tmp_path / "log", rows))
+    assert len(found.result["pairs"]) == 6
+    letters = found.result["letters"]
+    assert next(iter(letters)) == "b" and letters["b"] == "a" and letters["a"] == letters["c"] == "b" and letters["d"] == "c"
+    assert (found.decision, found.exit_code) == ("worse", 1)
+    assert all(entry["test"]["p_holm"] >= entry["test"]["p"] for entry in found.result["pairs"])
+    assert set(found.differences.measure) == {"success", "subgoals", "reward", "steps", "seconds", "price"}
+    assert list(osel.compare(log_of(tmp_path / "more", rows), policies=["d", "b"]).flips.columns)[:3] == ["first", "second", "instance"]
+
+
+@pytest.mark.parametrize(("cells", "kind"), [((60, 20, 2, 18), "failure"), ((20, 4, 4, 12), "skipped"), ((60, 2, 20, 18), None)])
+def test_junit_says_what_the_exit_code_says(tmp_path, cells, kind):
+    osel.compare(*two_logs(tmp_path, *cells), junit=tmp_path / "new" / "out.xml")
+    root = ElementTree.fromstring((tmp_path / "new" / "out.xml").read_text())
+    (case,) = root.iter("testcase")
+    assert [child.tag for child in case if child.tag != "system-out"] == ([kind] if kind else [])
+    assert root.attrib["failures"] == str(int(kind == "failure")) and root.attrib["skipped"] == str(int(kind == "skipped"))
+
+
+def test_names_of_others_are_neither_markup_nor_control_characters(tmp_path):
+    rows = [row for name in ("a|b<script>", "c\x1b[31m*d*") for row in rows_of(name, [True] * 20)]
+    osel.compare(log_of(tmp_path / "log", rows), markdown=tmp_path / "out.md", junit=tmp_path / "out.xml")
+    text = (tmp_path / "out.md").read_text()
+    assert "<script>" not in text and "\x1b" not in text and r"a\|b" in text and r"\*d\*" in text
+    ElementTree.fromstring((tmp_path / "out.xml").read_text())
+
+
+def test_a_plan_says_how_many_instances_it_takes(tmp_path, capsys):
+    logs = two_logs(tmp_path, 40, 10, 10, 40)
+    assert main(["compare", *map(str, logs), "--plan", "--detect", "0.1"]) == 0
+    assert "more than the log has" in " ".join(capsys.readouterr().out.split())
+    fine, coarse = (int(osel.compare(*logs, plan=True, detect=detect).plan.needed[0]) for detect in (0.05, 0.1))
+    assert 3.5 < fine / coarse < 4.5 and 150 < coarse < 180  # a fifth of the pairs are discordant
+    with pytest.raises(UsageError, match="--plan compares nothing"):
+        osel.compare(*logs, plan=True, junit=tmp_path / "x.xml")
+
+
+def test_tables_of_others_are_compared(tmp_path):
+    first, second = pattern(20, 6, 1, 20)
+    table = tmp_path / "evals.csv"
+    lines = [
+        f"q{row},question {row},{model},{int(score)}" for model, column in (("small", first), ("large", second)) for row, score in enumerate(column)
+    ]
+    table.write_text("\n".join(["id,prompt,model,correct", *lines]) + "\n")
+    osel.ingest(files=[str(table)], out=tmp_path / "log", key="id", text="prompt", policy_column="model", success="correct")
+    found = osel.compare(tmp_path / "log", policies=["small", "large"])
+    (entry,) = found.result["pairs"]
+    assert (entry["instances"], entry["test"]["gained"], entry["test"]["lost"]) == (47, 1, 6)
+    assert "reward" in entry["missing"] and "reward" not in entry["differences"]
+
+
+def test_wrong_settings_are_named(tmp_path):
+    (one, other) = two_logs(tmp_path, 5, 5, 5, 5)
+    both = log_of(tmp_path / "both", rows_of("mine", [True] * 10) + rows_of("yours", [True] * 10))
+    for call, kind, message in (
+        (lambda: osel.compare(one), UsageError, "one policy, mine, is compared with nothing"),
+        (lambda: osel.compare(one, one), UsageError, "given twice"),
+        (lambda: osel.compare(one, one / ".." / one.name), UsageError, "mine of .* is given twice"),
+        (lambda: osel.compare(one, other, detect=0.1), UsageError, "--detect is what --plan plans for"),
+        (lambda: osel.compare(one, both), UsageError, "both has several policies, mine, yours: name one with --policies"),
+        (lambda: osel.compare(one, other, policies=["a", "b", "c"]), UsageError, "2 logs need one name for all, or one each"),
+        (lambda: osel.compare(one, other, policies="mime"), UnknownNameError, "did you mean 'mine'"),
+        (lambda: osel.compare(one, tmp_path / "none"), SettingError, "there is no folder"),
+        (lambda: osel.compare(), SettingError, "logs"),
+        (lambda: osel.compare(one, other, margin=2), SettingError, r"margin: must lie in \[0.0, 1.0\]"),
+        (lambda: osel.compare(one, other, detect=0.0, plan=True), SettingError, "detect: must lie in"),
+        (lambda: osel.compare(one, other, out=one), UsageError, "is not empty"),
+        (lambda: osel.compare(one, other, junit=tmp_path), UsageError, "--junit .* is a folder"),
+    ):
+        with pytest.raises(kind, match=message):
+            call()
+    osel.compare(one, other, out=tmp_path / "out")
+    with pytest.raises(UsageError, match="add --overwrite"):
+        osel.compare(one, other, out=tmp_path / "out")
+    assert osel.compare(one, other, out=tmp_path / "out", overwrite=True).file == tmp_path / "out" / "compare.json"
+
+
+def made_up(generator: np.random.Generator, pairs: int, gained: float, lost: float) -> Pairs:
+    cells = generator.choice(4, size=pairs, p=[0.5, gained, lost, 0.5 - gained - lost])
+    values = [{"success": np.isin(cells, kinds).astype(float)} for kinds in ((0, 2), (0, 1))]
+    contenders = [Contender(name, name, None) for name in ("before", "after")]
+    return Pairs(*contenders, ("",) * pairs, ("",) * pairs, *values, pairs, 0, 0, (0, 0), {})
+
+
+def test_claims_are_wrong_as_rarely_as_promised():
+    from osel_sim.analysis.comparison import _probability
+
+    def decisions(pairs: int, gained: float, lost: float, comparisons: int = 500) -> dict[str, float]:
+        generator = np.random.default_rng([pairs, int(1000 * lost)])
+        found = []
+        for _ in range(comparisons):
+            sample = made_up(generator, pairs, gained, lost)
+            found.append(_verdict(sample, _probability(sample), 1, 0.05, 0.8)["decision"])
+        return {name: found.count(name) / comparisons for name in ("better", "worse", "no worse", "not enough data")}
+
+    slack = 2 * np.sqrt(0.025 * 0.975 / 500)
+    for pairs in (25, 100, 400):
+        equal = decisions(pairs, 0.1, 0.1)
+        assert equal["better"] <= 0.025 + slack and equal["worse"] <= 0.025 + slack
+        at_margin = decisions(pairs, 0.075, 0.125)  # 5 points lower, as the margin says
+        assert at_margin["better"] + at_margin["no worse"] <= 0.025 + slack
+    assert decisions(1000, 0.05, 0.15)["worse"] > 0.95 and decisions(1000, 0.1, 0.1)["no worse"] > 0.85
+
+
+def test_the_instances_that_would_tell_mostly_do():
+    generator = np.random.default_rng(4)
+    from osel_sim.analysis.comparison import _probability
+
+    told = 0
+    for _ in range(200):
+        more = _verdict(made_up(generator, 60, 0.05, 0.15), 1.0, 1, 0.02, 0.8)["more"] or 0
+        sample = made_up(generator, 60 + min(more, 400), 0.05, 0.15)
+        told += _verdict(sample, _probability(sample), 1, 0.02, 0.8)["decision"] != "not enough data"
+    assert told / 200 > 0.7
