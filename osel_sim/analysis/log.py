@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.context.appended import TASK_NAME, own_encoder, parts_of, task_parts
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.core.files import read_json
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts
@@ -150,6 +151,22 @@ class LoggedOutcomes:
         """Mean reward over the repeats, (N, P); NaN where a policy has none on an instance."""
         return mean_over_repeats(self.rewards(weights))
 
+    @property
+    def parts(self) -> tuple[int, ...]:
+        """Lengths of the encoder's own part of a context and of what is appended to it; empty where nothing is."""
+        return parts_of(self.encoder, self.contexts.shape[1])
+
+    def with_tasks(self) -> "LoggedOutcomes":
+        """The same with the name of each instance's task appended to its context.
+
+        Raises:
+            UsageError: it is there already.
+        """
+        if self.encoder.endswith(TASK_NAME):
+            raise UsageError(f"--context task: the contexts of {self.source} have the task already ({self.encoder})")
+        appended = task_parts(self.labels("task"))
+        return replace(self, contexts=np.concatenate([self.contexts, appended.parts], axis=1), encoder=self.encoder + appended.name)
+
     def half(self, which: Half) -> NDArray[np.bool_]:
         """Which instances, (N,), belong to a half: one to choose settings or policies by, the other to score them on."""
         return np.array([instance.half == which for instance in self.instances], bool)
@@ -212,7 +229,7 @@ def read_log(folder: Path, encoder: str | None = None) -> LoggedOutcomes:
         raise DataError(f"{folder / ROLLOUTS}: the log has no rows")
     instances = tuple(dict.fromkeys(row.instance for row in rows))
     identity, contexts = read_contexts(folder, instances, encoder or metadata.get("encoder"))
-    return _logged(folder, rows, metadata, identity, contexts, read_skills(folder, identity, metadata.get(DECLARED)))
+    return _logged(folder, rows, metadata, identity, contexts, read_skills(folder, own_encoder(identity), metadata.get(DECLARED)))
 
 
 def read_outcomes(folder: Path) -> LoggedOutcomes:
@@ -284,8 +301,7 @@ def read_contexts(folder: Path, instances: Sequence[str], encoder: str | None) -
     contexts = cache.table(encoder, instances)
     if not np.isfinite(contexts).all():
         raise DataError(f"{cache.file}: contexts of {encoder!r} are not all finite")
-    identity = encoder if encoder in known else next(name for name in known if name.partition("@")[0] == encoder)
-    return identity, np.ascontiguousarray(contexts, np.float32)
+    return cache.identity(encoder), np.ascontiguousarray(contexts, np.float32)
 
 
 def read_skills(folder: Path, encoder: str, declared: Any) -> Skills | None:

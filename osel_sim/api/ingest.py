@@ -24,7 +24,20 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-TABLE_FLAGS = ("text", "image", "group", "key", "policy_column", "repeat_column", "duplicates", "propensity", "price_unit", "name", *VALUES)
+TABLE_FLAGS = (
+    "text",
+    "image",
+    "group",
+    "context",
+    "key",
+    "policy_column",
+    "repeat_column",
+    "duplicates",
+    "propensity",
+    "price_unit",
+    "name",
+    *VALUES,
+)
 COLUMNS = Group("Columns of the tables, instead of --map (a column's name; numbers hold for every row)", 1)
 DATASET = Group("A LeRobotDataset, with --metric action-mse", 2)
 
@@ -57,6 +70,8 @@ class IngestConfig(TrustSettings):
     """columns with paths of images, relative to the table"""
     group: Annotated[str | None, COLUMNS] = None
     """what the log calls the task, such as a question's subject: a column, or a template"""
+    context: Annotated[Names | None, COLUMNS] = None
+    """columns that are part of the context besides text and images: numbers, or names of few values; task stands for the group"""
     key: Annotated[str | None, COLUMNS] = None
     """identifies an instance: a column, or a template (default: its text, images and group)"""
     policies: Annotated[Names | None, COLUMNS] = None
@@ -163,6 +178,7 @@ def _refuse(config: IngestConfig, names: Sequence[str], with_what: str) -> None:
 
 
 def _table(config: IngestConfig, out: Path) -> IngestResult:
+    from osel_sim.context.appended import column_parts
     from osel_sim.context.encoder import load_log_encoder
     from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF
@@ -208,7 +224,11 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     if converted.propensities is not None:
         metadata[PROPENSITIES] = converted.propensities
     texts = [item.text for item in instances]
-    identity = write_log(out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(columns.images), config.device), metadata)
+    values = {column: [source.context[at] for source in converted.sources] for at, column in enumerate(columns.context)}
+    appended = column_parts(values) if values else None
+    identity = write_log(
+        out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(columns.images), config.device), metadata, appended
+    )
     return _result(config, out, converted.rows, identity, start, tuple(notes))
 
 

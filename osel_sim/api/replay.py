@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-COSTS, SKILLS = "expected_costs", "skills"
-"""Settings of selectors that are told what policies cost, and what they were made for, rather than learn it."""
+COSTS, SKILLS, PARTS = "expected_costs", "skills", "parts"
+"""Settings of selectors that are told what policies cost, what they were made for, and what a context consists of, rather than learn it."""
 
 
 @settings
@@ -54,6 +54,8 @@ class ReplayConfig(LoggedRewardSettings):
     """do not replay selectors at other weights of time and price as well"""
     encoder: Annotated[str | None, OTHER] = None
     """whose contexts, where the log has several (default: the one it was recorded with)"""
+    context: Annotated[Literal["task"] | None, OTHER] = None
+    """append the task's name to the contexts; auto finds out whether it helps"""
 
     @property
     def folder(self) -> Path:
@@ -141,6 +143,8 @@ class _Replay:
         from osel_sim.formats.replay_result import write_replay
 
         config = self.config
+        if config.context:
+            log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
         here = setup(weights)
@@ -152,7 +156,7 @@ class _Replay:
             )
         choices = with_fixed(chosen, best)
         result = build(log, weights, preset, choices, best, left_out, range(config.seeds))
-        result["log"]["half"] = config.half
+        result["log"] |= {"half": config.half, "context": config.context}
         result["off_policy"] = off_policy
         result |= _told(here)
         write_replay(config.folder, result, choices, tables(result))
@@ -207,6 +211,8 @@ class _Replay:
             known: dict[str, Any] = {} if config.unknown_costs else {COSTS: others.expected_costs(weights)}
             if log.skills is not None and not config.unknown_skills:
                 known[SKILLS] = log.skills
+            if log.parts:
+                known[PARTS] = log.parts
             warm_start = WarmStart(others.contexts, others.rewards(weights)) if config.half else None
             return Setup(weights, {name: wanted_of(name, known) for name in selectors if name not in self.factories}, warm_start)
 

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from osel_sim.api.results import RunResult
 from osel_sim.api.settings import (
@@ -61,6 +61,8 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """number of decisions"""
     encoder: Annotated[str | None, MAIN] = None
     """osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder"""
+    context: Annotated[Literal["task"] | None, OTHER] = None
+    """append the task's name to the contexts; auto finds out whether it helps"""
     seed: Annotated[Index, MAIN] = 0
     """of instances and selector"""
     out: Annotated[Path | None, MAIN] = None
@@ -265,31 +267,39 @@ class _Run:
             "split": config.split,
             "reward": asdict(self.weights),
             "counterfactual": config.counterfactual,
+            **({"context": config.context} if config.context else {}),
             "content": {**content_digests(self.tasks, self.everyone), **warm},
         }
 
     def _selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
-        from osel_sim.selection.registry import make_selector
+        from osel_sim.context.appended import LENGTH
+        from osel_sim.selection.registry import make_selector, wanted_of
 
         names = [spec.name for spec in self.policies]
+        parts = (encoder.dimension, LENGTH) if self.config.context else (encoder.dimension,)
         if self.factory is not None:
-            return self.factory(names, encoder.dimension, self.config.seed)
+            return self.factory(names, sum(parts), self.config.seed)
         known = _declared(self.config, self.tasks, self.policies, self.weights, encoder)
         if "skills" in known:
             configuration["skills"] = known["skills"].digest if known["skills"] is not None else None
-        return make_selector(self.config.selector, names, encoder.dimension, self.config.seed, **known)
+        if len(parts) > 1:
+            known |= wanted_of(self.config.selector, {"parts": parts})
+        return make_selector(self.config.selector, names, sum(parts), self.config.seed, **known)
 
     def _log(self, folder: Path, encoder: str) -> "LoggedOutcomes":
         """The rollout log of a warm start."""
         from osel_sim.analysis.log import read_log
 
-        return read_log(folder, encoder).only([spec.name for spec in self.policies])
+        log = read_log(folder, encoder).only([spec.name for spec in self.policies])
+        return log.with_tasks() if self.config.context else log
 
     def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
         from osel_sim.episodes.live import LiveOptions, LiveRun
 
         config = self.config
-        options = LiveOptions(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise)
+        options = LiveOptions(
+            config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context
+        )
         return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder))
 
     def _subscribers(self, folder: Path) -> "list[RunSubscriber]":

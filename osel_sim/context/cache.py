@@ -1,6 +1,7 @@
 """Contexts on disk: `contexts.npz` beside a journal or rollout log, keyed by encoder and instance."""
 
 import logging
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -14,6 +15,8 @@ from osel_sim.interface.encoder import Context, Encoder, Image
 logger = logging.getLogger(__name__)
 
 FILE = "contexts.npz"
+_DIGEST = re.compile(r"@[^+#]*|#\w+")
+"""What an identity has besides names: digests, and which part of a context it is."""
 EXAMPLE = "skill:"
 """How the keys of examples of skills begin; an instance's begins with the name of its task."""
 
@@ -51,7 +54,7 @@ class ContextCache:
 
     def get(self, encoder: str, instance: str) -> Context | None:
         """The context (d,) of an instance, or None. `encoder` is an identity, or a name where only one identity here has it."""
-        return self._contexts.get(self._identity(encoder), {}).get(instance)
+        return self._contexts.get(self.identity(encoder), {}).get(instance)
 
     def table(self, encoder: str, instances: Sequence[str]) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
         """Contexts (N, d) of these instances, in their order.
@@ -59,7 +62,7 @@ class ContextCache:
         Raises:
             DataError: an encoder or instance has no context here.
         """
-        known = self._contexts.get(self._identity(encoder))
+        known = self._contexts.get(self.identity(encoder))
         if known is None:
             raise DataError(f"{self.file}: no contexts of encoder {encoder!r}, only of: {', '.join(self.encoders()) or 'none'}")
         missing = [instance for instance in instances if instance not in known]
@@ -69,14 +72,14 @@ class ContextCache:
 
     def examples(self, encoder: str, skill: str) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
         """Contexts (n, d) of the examples of a skill, in order; (0, 0) if there are none."""
-        known, found = self._contexts.get(self._identity(encoder), {}), list[Context]()
+        known, found = self._contexts.get(self.identity(encoder), {}), list[Context]()
         while _example(skill, len(found)) in known:
             found.append(known[_example(skill, len(found))])
         return np.stack(found) if found else np.zeros((0, 0), np.float32)
 
     def skills(self, encoder: str) -> list[str]:
         """Names of the skills that have examples here, sorted."""
-        known = self._contexts.get(self._identity(encoder), {})
+        known = self._contexts.get(self.identity(encoder), {})
         return sorted({key.removeprefix(EXAMPLE).rpartition(":")[0] for key in known if key.startswith(EXAMPLE)})
 
     def put_examples(self, encoder: str, skill: str, contexts: Sequence[Context]) -> None:
@@ -120,10 +123,16 @@ class ContextCache:
             np.savez(handle, allow_pickle=False, **arrays)
         self._unsaved = 0
 
-    def _identity(self, encoder: str) -> str:
+    def identity(self, encoder: str) -> str:
+        """The identity that is here of an encoder by its name, such as `tfidf`, `tfidf+task`; an unknown name stays as it is.
+
+        Raises:
+            DataError: several identities have that name.
+        """
         if encoder in self._contexts:
             return encoder
-        matches = [identity for identity in self._contexts if identity.partition("@")[0] == encoder]
+        matches = [identity for identity in self._contexts if _DIGEST.sub("", identity) == encoder]
+        matches = matches or [identity for identity in self._contexts if identity.partition("@")[0] == encoder]
         if len(matches) > 1:
             raise DataError(f"{self.file}: several versions of encoder {encoder!r}: {', '.join(sorted(matches))}; name one of them")
         return matches[0] if matches else encoder

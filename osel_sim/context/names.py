@@ -11,6 +11,8 @@ if TYPE_CHECKING:  # imports numpy
     from osel_sim.interface.encoder import Encoder
 
 DEFAULT_ENCODER = "osel_small"
+TASK = "task"
+"""What stands for the name of the task where parts of a context are named."""
 CONFIG = "open_clip_config.json"
 PLUGINS: "Registry[Callable[[], Encoder]]" = Registry("encoder", "osel_sim.encoders", {})
 """Encoders of other packages."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.context.appended import name_part
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.episodes.drivers import Drivers
@@ -38,6 +39,7 @@ class LiveOptions:
         levels: of which each instance has one, at random.
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
+        context: `task` appends the task's name to the contexts that the selector is shown.
     """
 
     seed: int
@@ -47,6 +49,7 @@ class LiveOptions:
     counterfactual: bool = False
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
+    context: str | None = None
 
 
 class LiveRun:
@@ -218,7 +221,8 @@ class LiveRun:
                 env.load(instance)
             return view(env, self.encoder)
 
-        return self.cache.encode(self.encoder, instance.key, images, instance.instruction)
+        context = self.cache.encode(self.encoder, instance.key, images, instance.instruction)
+        return np.concatenate([context, name_part(instance.task)]) if self.options.context else context
 
     def _reward(self, outcome: Outcome) -> float | None:
         return None if outcome.error is not None else reward(outcome, self.options.weights)

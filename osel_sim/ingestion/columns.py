@@ -34,6 +34,7 @@ from typing import Annotated
 from pydantic import AfterValidator, Discriminator, Tag
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 
+from osel_sim.context.names import TASK
 from osel_sim.formats.toml_types import TABLE, OneOf, Texts, between
 
 DUPLICATES = ("refuse", "drop", "repeats", "keep")
@@ -179,6 +180,7 @@ class Columns:
         images: columns with paths of images, relative to the table that names them.
         group: template of the log's task, or None.
         key: template of what identifies an instance, or None: its text, images and group do.
+        context: columns that are part of the context, `task` standing for the log's task.
         labels: log column (`split`, `phrasing`, `target`, `container`) -> the table's column.
         duplicates: what to do with a second row of the same instance (and policy, and repeat).
         policy: column of policies in a long table; None where the table is wide.
@@ -202,6 +204,7 @@ class Columns:
     policy: str | None
     repeat: str | None
     propensity: str | None = None
+    context: tuple[str, ...] = ()
     policies: dict[str, PolicyColumns] = field(default_factory=dict)
     default: PolicyColumns | None = None
 
@@ -215,6 +218,7 @@ class Columns:
         """Columns it needs -> the key that asks for them."""
         needed = {name: "instance.text" for name in FIELD.findall(self.text)}
         needed |= {name: "instance.images" for name in self.images}
+        needed |= {name: "instance.context" for name in self.context if name != TASK}
         needed |= {column: f"instance.{label}" for label, column in self.labels.items()}
         needed |= {name: "instance.key" for name in FIELD.findall(self.key or "")}
         needed |= {name: "instance.group" for name in FIELD.findall(self.group or "")}

@@ -46,6 +46,7 @@ def parse_columns(data: dict[str, Any], file: Path | str, base: Path) -> Columns
         images=instance.images,
         group=instance.group,
         key=instance.key,
+        context=tuple(dict.fromkeys(instance.context)),
         labels={label: column for label in LABELS if (column := getattr(instance, label)) is not None},
         duplicates=instance.duplicates,
         policy=outcome.policy,

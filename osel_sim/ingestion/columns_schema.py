@@ -94,6 +94,8 @@ class InstanceTable:
     """What the log calls the task: a column, or a template."""
     key: Annotated[str, AfterValidator(_template)] | None = None
     """What identifies an instance: a column, or a template such as `{subject}-{number}`; left out: its text, images and group do."""
+    context: Texts = ()
+    """Columns that are part of the context besides text and images: numbers, or names of few different values; `task` stands for the group."""
     split: str | None = None
     """Column of the log's `split`."""
     phrasing: str | None = None

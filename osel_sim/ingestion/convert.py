@@ -1,11 +1,13 @@
 """Rows of an outcome table as rows of the rollout log."""
 
+import contextlib
 import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from osel_sim.context.names import TASK
 from osel_sim.core.errors import DataError, did_you_mean
 from osel_sim.formats.rollout_log import Row
 from osel_sim.formats.toml_types import quoted
@@ -26,6 +28,7 @@ class Source:
 
     Attributes:
         images: files, in order.
+        context: values of the columns that are part of the context.
         record: where it was read first.
     """
 
@@ -33,6 +36,7 @@ class Source:
     task: str
     text: str
     images: tuple[Path, ...]
+    context: tuple[str | float | None, ...]
     record: Record
 
 
@@ -127,21 +131,35 @@ def _source(
     task = fill(columns.group, lambda column: text(record, column)) if columns.group else columns.name
     words = fill(columns.text, lambda column: text(record, column))
     images = tuple(_image(record, column) for column in columns.images)
+    context = tuple(task if column == TASK else _context_value(record, column) for column in columns.context)
     identity = (task, fill(columns.key, lambda column: text(record, column))) if columns.key else (task, words, images)
     known = identity in keys
     each_is_one = columns.propensity is not None or (columns.duplicates == "keep" and columns.policy is None)
     if known and not each_is_one:
         first = sources[keys[identity]]
+        other = f"row {first.record.number} of {first.record.file}"
         if (first.text, first.images) != (words, images):
-            other = f"row {first.record.number} of {first.record.file}"
             raise DataError(f"{record.where}: instance {quoted(first.key)} has another text or image here than in {other}")
+        for column, now, then in zip(columns.context, context, first.context, strict=True):
+            if now != then:
+                raise record.error(column, f"is {quoted(now)} here, of the same instance ({quoted(first.key)}) it is {quoted(then)} in {other}")
         return first, True
     if known and columns.key:
         raise _duplicate(columns, record, sources[keys[identity]].record, f"instance {quoted(keys[identity])}")
     counters[task] = counters.get(task, 0) + 1
     key = f"{task}/{identity[1] if columns.key else format(counters[task], '06d')}"
     keys[identity] = key
-    return Source(key, task, words, images, record), False
+    return Source(key, task, words, images, context, record), False
+
+
+def _context_value(record: Record, column: str) -> str | float | None:
+    """A number where it can be read as one, else a text; None where there is nothing."""
+    value = record.values[column]
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return None
+    with contextlib.suppress(DataError):
+        return number(record, column)
+    return text(record, column)
 
 
 def _image(record: Record, column: str) -> Path:

@@ -33,6 +33,7 @@ def as_data(options: Any, files: tuple[str, ...], there: Collection[str] = ()) -
         "text": options.text,
         "images": None if options.image is None else list(options.image),
         "group": options.group,
+        "context": None if options.context is None else list(options.context),
         "key": options.key,
         "duplicates": options.duplicates,
     }

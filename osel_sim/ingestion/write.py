@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from osel_sim.context.appended import Appended
 from osel_sim.core.errors import UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_json
 from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
@@ -52,7 +55,13 @@ def check_out(folder: Path, instances: Iterable[IngestedInstance]) -> str:
 
 
 def write_log(
-    folder: Path, inputs: str, rows: list[Row], instances: Sequence[IngestedInstance], load_encoder: Callable[[], Encoder], metadata: dict[str, Any]
+    folder: Path,
+    inputs: str,
+    rows: list[Row],
+    instances: Sequence[IngestedInstance],
+    load_encoder: Callable[[], Encoder],
+    metadata: dict[str, Any],
+    appended: Appended | None = None,
 ) -> str:
     """Encode what is not encoded yet, with a progress bar, and write the log. An interrupted one goes on where it was.
 
@@ -61,9 +70,10 @@ def write_log(
     Args:
         inputs: from `check_out`.
         metadata: of the log; the encoder is added.
+        appended: to the context of each instance, in a second set of contexts, which the log then names as its own.
 
     Returns:
-        the encoder's identity.
+        the encoder's identity, with what is appended.
 
     Raises:
         UsageError: another log is there.
@@ -84,8 +94,15 @@ def write_log(
             for item in missing:
                 cache.encode(encoder, item.key, item.images, item.text)
                 bar.update()
+        identity = encoder.identity
+        if appended is not None:
+            contexts = cache.table(identity, [item.key for item in instances])
+            identity += appended.name
+            for item, context in zip(instances, np.concatenate([contexts, appended.parts], axis=1), strict=True):
+                if cache.get(identity, item.key) is None:
+                    cache.put(identity, item.key, context)
     finally:
         cache.save()
     if not there:
-        write_rollouts(folder, rows, {**metadata, "encoder": encoder.identity})
-    return encoder.identity
+        write_rollouts(folder, rows, {**metadata, "encoder": identity})
+    return identity

@@ -15,6 +15,7 @@ from osel_sim.analysis.live import is_live_run, read_live
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats, read_log
 from osel_sim.analysis.measures import curves, measure_fixed
 from osel_sim.analysis.oracles import oracles
+from osel_sim.context.appended import TASK_NAME
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.replay_result import REPLAY, Choices, read_replay
 from osel_sim.formats.rollout_log import read_rollouts
@@ -171,6 +172,8 @@ def _log(folder: Path, result: Mapping[str, Any], choices: Choices, log_folder: 
     if not source.is_dir():
         raise UsageError(f"the log {source} that {folder} was replayed from is not there; give its folder with --log")
     encoder = result["log"]["encoder"]
+    if result["log"].get("context"):
+        encoder = encoder.removesuffix(TASK_NAME)  # appended when it was replayed, and not in the log
     log = (read_live(source, encoder).outcomes if is_live_run(source) else read_log(source, encoder)).only(choices.policies)
     row = {key: index for index, key in enumerate(log.keys)}
     missing = [key for key in choices.instances if key not in row]

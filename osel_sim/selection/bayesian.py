@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -13,7 +13,7 @@ from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.files import content_digest
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
-from osel_sim.selection.features import Array, Features, Sketch
+from osel_sim.selection.features import Array, Features, Part, Sketch
 from osel_sim.selection.regression import Moments, SharedRegression, fit
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
 from osel_sim.statistics.best import probability_of_best
@@ -51,7 +51,8 @@ class Prior:
         expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
             learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
         warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
-        skills: what policies are said to be able to do, as a first guess of their success; None: nothing is said.
+        skills: what policies are said to be able to do, as a first guess of their success; None: nothing is said. They look at the first part only.
+        parts: lengths of the two parts of a context, such as the encoder's and the task's; empty where it is one whole.
 
     Raises:
         UsageError: a number out of range.
@@ -67,6 +68,7 @@ class Prior:
     expected_costs: Mapping[str, float] | None = None
     warm_contexts: ArrayLike | None = None
     skills: Skills | None = None
+    parts: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         for name in ("optimism", "chance", "mean_optimism", "mean_chance"):
@@ -77,6 +79,8 @@ class Prior:
             raise UsageError(f"floor must lie in [0, 1], got {self.floor}")
         if not self.signals or not all(math.isfinite(signal) and signal > 0.0 for signal in self.signals):
             raise UsageError(f"signals must be one or more finite numbers > 0, got {list(self.signals)}")
+        if self.parts and (len(self.parts) != 2 or min(self.parts) < 1):
+            raise UsageError(f"parts must be two lengths of at least 1, or none, got {list(self.parts)}")
         if not self.shared or not all(math.isfinite(signal) and signal >= 0.0 for signal in self.shared):
             raise UsageError(f"shared must be one or more finite numbers >= 0, got {list(self.shared)}")
 
@@ -84,7 +88,8 @@ class Prior:
     def numbers(self) -> dict[str, Any]:
         """How it explores and what it considers, as JSON values."""
         lists = {"signals": [float(value) for value in self.signals], "shared": [float(value) for value in self.shared]}
-        return {**lists, **{name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}}
+        parts = {"parts": list(self.parts)} if self.parts else {}
+        return {**lists, **{name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}, **parts}
 
 
 class BayesianSelector(SelectorBase):
@@ -103,7 +108,8 @@ class BayesianSelector(SelectorBase):
     optimism alone is UCB, chance alone Thompson sampling.
 
     Whenever the number of decisions has grown by a quarter, features are fitted afresh to the contexts seen so far, and the regression is computed
-    again on them; in between it is updated decision by decision.
+    again on them; in between it is updated decision by decision. Where a context has two parts, features of the first, of both and of the second are
+    fitted, and those of the highest evidence kept until the next time.
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
@@ -120,14 +126,20 @@ class BayesianSelector(SelectorBase):
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, features: Features, prior: Prior) -> None:
         super().__init__(policies, context_dim, seed)
         self._prior, self._skills = prior, prior.skills
-        if self._skills is not None and self._skills.dimension != context_dim:
-            raise UsageError(f"the examples of skills have length {self._skills.dimension}, contexts {context_dim}")
+        parts = tuple(prior.parts) or (context_dim,)
+        if sum(parts) != context_dim:
+            raise UsageError(f"parts {list(parts)} do not add up to the length of a context, {context_dim}")
+        if self._skills is not None and self._skills.dimension != parts[0]:
+            raise UsageError(f"the examples of skills have length {self._skills.dimension}, contexts {parts[0]}")
         costs = prior.expected_costs
         self._costs_declared = None if costs is None else {name: float(cost) for name, cost in costs.items()}
         self._costs = np.array([self._cost(name) for name in self.policies])
-        self._sketch = Sketch(context_dim)
+        self._sketch, self._first = Sketch(context_dim, parts), parts[0]
         self._warm, self._warm_digest = self._check_warm(prior.warm_contexts)
-        self._features = features
+        end = self._sketch.parts[0]
+        seen = (slice(None, end), slice(None), slice(end, None)) if prior.parts else ()
+        self._views: list[Features] = [Part(deepcopy(features), columns) for columns in seen] or [features]
+        self._view = 0
         self._generator = np.random.default_rng(seed)
         self._guess = np.zeros(1) if self._skills is None else np.array([DECLARED, NOT_DECLARED])
         self._contexts: list[NDArray[np.float32]] = []
@@ -150,6 +162,15 @@ class BayesianSelector(SelectorBase):
     def signal(self) -> float:
         """How much the context matters to the differences between policies by the evidence so far: variance relative to the noise."""
         return self._signal
+
+    @property
+    def parts_used(self) -> str:
+        """Which parts of a context the features are of by the evidence so far: `first`, `both` or `second`; `whole` where it has no parts."""
+        return ("first", "both", "second")[self._view] if self._prior.parts else "whole"
+
+    @property
+    def _features(self) -> Features:
+        return self._views[self._view]
 
     def _select(self, context: Context) -> Choice:
         prior, rows = self._prior, self._rows(context, self._sketch(context))
@@ -187,17 +208,29 @@ class BayesianSelector(SelectorBase):
         targets, chosen = np.array(self._targets), np.array(self._chosen, np.int64)
         self._measure(chosen, targets)
         targets = self._standard(targets)
-        self._fit_features(np.concatenate([self._warm, contexts]), contexts, chosen, targets)
+        found = []
+        for view in range(len(self._views)):
+            self._view = view
+            self._fit_features(np.concatenate([self._warm, contexts]), contexts, chosen, targets)
+            found.append(self._regress(contexts, chosen, targets))
+        self._view = int(np.argmax([evidence for evidence, _, _ in found]))
+        _, self._signal, self._regression = found[self._view]
+
+    def _regress(self, contexts: Array, chosen: NDArray[np.int64], targets: Array) -> tuple[float, float, SharedRegression]:
+        """Evidence for the features that there are now, how much they matter by it, and the regression on them."""
         heads = np.array(self._heads, np.float64).reshape(-1, len(self._guess))
         rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
         moments = Moments.of(rows, chosen, targets - heads @ self._guess, len(self._costs))
         own = (NOTHING, *(float(signal) for signal in self._prior.signals)) if self._features.dim and len(targets) > 1 else (NOTHING,)
         shared = [max(NOTHING, float(signal)) for signal in self._prior.shared] if len(own) > 1 else [NOTHING]
         found = [regression for signal in own for regression in fit(moments, self._scale(signal), [self._scale(common) for common in shared])]
-        weights = np.exp(np.array([regression.evidence for regression in found]) - max(regression.evidence for regression in found))
+        most = max(regression.evidence for regression in found)
+        weights = np.exp(np.array([regression.evidence for regression in found]) - most)
+        evidence = most + math.log(weights.mean())
         weights = (weights / weights.sum()).reshape(len(own), len(shared))
-        self._signal = float(weights.sum(axis=1) @ np.array(own))
-        [self._regression] = fit(moments, self._scale(self._signal), [self._scale(float(weights.sum(axis=0) @ np.array(shared)))])
+        signal = float(weights.sum(axis=1) @ np.array(own))
+        [regression] = fit(moments, self._scale(signal), [self._scale(float(weights.sum(axis=0) @ np.array(shared)))])
+        return evidence, signal, regression
 
     def _fit_features(self, contexts: Array, own: Array, chosen: NDArray[np.int64], targets: Array) -> None:
         """Fit `features` to contexts, warm ones included; `own` are those decided on, `targets` (n,) what came of them, standardised."""
@@ -228,7 +261,7 @@ class BayesianSelector(SelectorBase):
         With skills (P, 2 + dim): how far a policy declares what is asked for, and how far not, instead of the constant.
         """
         features = self._features.transform(sketched[None].astype(np.float64))
-        share = np.ones((len(self._costs), 1)) if self._skills is None else self._skills.share(context, self.policies)[:, None]
+        share = np.ones((len(self._costs), 1)) if self._skills is None else self._skills.share(context[: self._first], self.policies)[:, None]
         heads = share if self._skills is None else np.concatenate([share, 1.0 - share], axis=1)
         return np.concatenate([heads, np.broadcast_to(features, (len(heads), features.shape[1]))], axis=1)
 
@@ -261,6 +294,7 @@ class BayesianSelector(SelectorBase):
             "heads": np.array(self._heads, np.float64).reshape(-1, len(self._guess)),
             "chosen": np.array(self._chosen, np.int64),
             "targets": np.array(self._targets, np.float64),
+            **({"view": self._view} if self._prior.parts else {}),
             "model": [self._centre, self._deviation, self._signal, self._next_fit],
             "random": self._generator.bit_generator.state,
             **{f"regression.{key}": value for key, value in self._regression.state().items()},
@@ -274,6 +308,7 @@ class BayesianSelector(SelectorBase):
         self._centre, self._deviation, self._signal, self._next_fit = state["model"]
         self._generator.bit_generator.state = state["random"]
         self._regression = SharedRegression(**{key: copy(value) for key, value in _part(state, "regression.").items()})
+        self._view = state.get("view", 0)
         self._features.load(_part(state, "features."))
 
 

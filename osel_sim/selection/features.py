@@ -1,5 +1,7 @@
 """Low-dimensional features of a context, fitted to contexts alone: whitened components, and the similarity to landmarks among them."""
 
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -20,7 +22,10 @@ NEGLIGIBLE = 1e-6
 class Features(Protocol):
     """What a context looks like to a linear model. Nothing here ever sees a reward, except where `fit` of a subclass says so."""
 
-    dim: int
+    @property
+    def dim(self) -> int:
+        """How many there are."""
+        ...
 
     def fit(self, contexts: Array) -> None:
         """Learn the features from contexts (n, sketched dim); `dim` may change."""
@@ -43,16 +48,65 @@ class Sketch:
     """Random projection (Johnson-Lindenstrauss) of long contexts; short ones pass through.
 
     The matrix depends on the length alone, not on a selector's seed: a state loads into a selector of any seed.
+
+    Args:
+        parts: lengths of the parts of a context, each of which is projected by itself; empty where it is one whole.
+
+    Attributes:
+        parts: what their lengths become.
     """
 
-    def __init__(self, context_dim: int) -> None:
-        self.dim = min(context_dim, SKETCH)
-        generator = np.random.default_rng(context_dim)
-        self._matrix = generator.normal(size=(context_dim, SKETCH)).astype(np.float32) / np.float32(np.sqrt(SKETCH)) if context_dim > SKETCH else None
+    def __init__(self, context_dim: int, parts: Sequence[int] = ()) -> None:
+        parts = parts or (context_dim,)
+        self.parts = tuple(min(part, SKETCH) for part in parts)
+        self.dim = sum(self.parts)
+        self._ends = np.cumsum([0, *parts]).tolist()
+        self._matrices = [_projection(part) if part > SKETCH else None for part in parts]
 
     def __call__(self, contexts: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Contexts (..., context_dim) -> (..., dim)."""
-        return contexts if self._matrix is None else contexts @ self._matrix
+        """Contexts (..., sum of parts) -> (..., dim)."""
+        if all(matrix is None for matrix in self._matrices):
+            return contexts
+        parts = [contexts[..., start:end] for start, end in pairwise(self._ends)]
+        short = [part if matrix is None else part @ matrix for part, matrix in zip(parts, self._matrices, strict=True)]
+        return short[0] if len(short) == 1 else np.concatenate(short, axis=-1)
+
+
+def _projection(length: int) -> NDArray[np.float32]:
+    return np.random.default_rng(length).normal(size=(length, SKETCH)).astype(np.float32) / np.float32(np.sqrt(SKETCH))
+
+
+class Part:
+    """Features of some columns of a context.
+
+    Args:
+        features: fresh ones.
+        columns: of the sketched context.
+    """
+
+    def __init__(self, features: Features, columns: slice) -> None:
+        self._features, self._columns = features, columns
+
+    @property
+    def dim(self) -> int:
+        """Of the features."""
+        return self._features.dim
+
+    def fit(self, contexts: Array) -> None:
+        """Learn from these columns."""
+        self._features.fit(contexts[:, self._columns])
+
+    def transform(self, contexts: Array) -> Array:
+        """Features of these columns."""
+        return self._features.transform(contexts[:, self._columns])
+
+    def state(self) -> State:
+        """Of the features."""
+        return self._features.state()
+
+    def load(self, state: State) -> None:
+        """Take over what `state` gave."""
+        self._features.load(state)
 
 
 class Components:

@@ -28,6 +28,7 @@ class KernelUCBSelector(BayesianSelector):
         expected_costs: policy -> declared alpha_time * time + alpha_price * price, as `episodes.expected_costs` gives; None learns them too.
         skills: which policies declare what, as `episodes.declared_skills` gives it; a first guess, overruled by outcomes. None: nothing is known.
         warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
+        parts: lengths of the encoder's part of a context and of what is appended to it; which of them are used, the evidence says. Empty: one whole.
         components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
         signals, shared, optimism, chance, mean_chance, floor: see `Prior`.
 
@@ -47,6 +48,7 @@ class KernelUCBSelector(BayesianSelector):
         expected_costs: Mapping[str, float] | None = None,
         skills: Skills | None = None,
         warm_contexts: ArrayLike | None = None,
+        parts: Sequence[int] = (),
         components: int = 32,
         whitening: float = 0.25,
         width: float = 0.7,
@@ -71,6 +73,7 @@ class KernelUCBSelector(BayesianSelector):
             expected_costs=expected_costs,
             warm_contexts=warm_contexts,
             skills=skills,
+            parts=parts,
         )
         super().__init__(policies, context_dim, seed, Landmarks(components, whitening, width, landmarks), prior)
 
