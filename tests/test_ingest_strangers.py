@@ -11,6 +11,7 @@ import pyarrow.parquet as parquet
 import pytest
 from PIL import Image
 
+import osel_sim as osel
 from osel_sim.core.errors import DataError, OselError
 from osel_sim.core.images import load_image
 from osel_sim.ingest import main as ingest_main
@@ -20,6 +21,7 @@ from osel_sim.ingestion.convert import Converted, convert
 from osel_sim.ingestion.doubts import alike, beyond_reason
 from osel_sim.ingestion.flags import as_data
 from osel_sim.ingestion.readers import first_columns, read_tables
+from osel_sim.replay import main as replay_main
 
 LONG = {"text": "q", "policy_column": "m", "success": ["s"]}
 WIDE = {"text": "q", "policies": ["a"], "success": ["a"]}
@@ -354,3 +356,61 @@ def test_each_row_of_logged_decisions_is_an_instance(tmp_path: Path) -> None:
     found = table(csv(tmp_path, "q,m,s,p\ngo,a,1,0.5\ngo,a,0,0.25\ngo,b,1,0.5\n"), **LONG, propensity="p")
     assert [(row.instance, row.policy) for row in found.rows] == [("log/000001", "a"), ("log/000002", "a"), ("log/000003", "b")]
     assert found.propensities == [0.5, 0.25, 0.5]
+
+
+CONTEXT = "q,s,room,size,a,b\ngo,x,attic,1,1,0\nrun,y,cellar,,0,1\nstop,x,,3,1,1\n"
+
+
+def test_columns_are_part_of_the_context_beside_the_text(tmp_path: Path) -> None:
+    flags = {"text": "q", "group": "s", "policies": ["a", "b"], "success": ["{policy}"], "context": ["room", "size", "task"]}
+    found = osel.ingest(files=[str(csv(tmp_path, CONTEXT))], out=tmp_path / "log", **flags)
+    log, text = osel.load_log(tmp_path / "log"), osel.load_log(tmp_path / "log", "tfidf")
+    assert log.encoder == found.encoder and log.parts == (text.contexts.shape[1], 33) and not text.parts
+    assert np.array_equal(log.contexts[:, :-33], text.contexts)
+    room, size, task = np.split(log.contexts[:, -33:], [16, 17], axis=1)
+    assert np.linalg.norm(room, axis=1) == pytest.approx([1, 1, 0])
+    assert np.ravel(size) == pytest.approx([-1, 0, 1])
+    assert np.array_equal(task[0], task[2]) and not np.array_equal(task[0], task[1])
+    replayed = osel.replay(
+        tmp_path / "log", selectors=["auto"], seeds=1, no_frontier=True, alpha_time=0, alpha_price=0, out=tmp_path / "replay", workers=1
+    )
+    assert osel.report(replayed.folder).page.is_file()
+
+
+def test_a_task_is_appended_when_a_log_is_replayed(tmp_path: Path) -> None:
+    flags = {"text": "q", "group": "s", "policies": ["a", "b"], "success": ["{policy}"]}
+    osel.ingest(files=[str(csv(tmp_path, CONTEXT))], out=tmp_path / "log", **flags)
+    settings = {"selectors": ["auto", "linucb"], "seeds": 1, "no_frontier": True, "alpha_time": 0, "alpha_price": 0, "workers": 1}
+    replayed = osel.replay(tmp_path / "log", context="task", out=tmp_path / "replay", **settings)
+    assert replayed.result["log"]["encoder"].endswith("+task#16")
+    assert osel.report(replayed.folder).page.is_file()
+    osel.ingest(files=[str(csv(tmp_path, CONTEXT))], out=tmp_path / "other", context=["task"], **flags)
+    with pytest.raises(OselError, match="have the task already"):
+        osel.replay(tmp_path / "other", context="task", out=tmp_path / "again", **settings)
+
+
+@pytest.mark.parametrize(
+    ("content", "context", "says"),
+    [
+        ("q,m,s,size\ngo,a,1,1\ngo,b,1,2\n", "size", r"row 2 .*column 'size': is 2.0 here, of the same instance .* it is 1.0 in row 1"),
+        ("q,m,s\ngo,a,1\n", "size", "size"),
+    ],
+)
+def test_columns_of_the_context_that_are_none(content: str, context: str, says: str, tmp_path: Path) -> None:
+    with pytest.raises(OselError, match=says):
+        table(csv(tmp_path, content), **LONG, context=[context])
+
+
+def test_hundreds_of_policies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"model-{number:03d}" for number in range(300)]
+    rows = [f"question {row}," + ",".join(str(int((row + column) % 300 < 150)) for column in range(300)) for row in range(4)]
+    file = csv(tmp_path, "q," + ",".join(names) + "\n" + "\n".join(rows))
+    flags = ["--alpha-time", "0", "--alpha-price", "0"]
+    assert ingest_main(["--files", str(file), "--text", "q", "--success", "{policy}", "--policies", *names, "--out", str(tmp_path / "log")]) == 0
+    told = capsys.readouterr().out
+    assert (
+        replay_main([str(tmp_path / "log"), "--selectors", "auto", "--seeds", "1", "--no-frontier", *flags, "--out", str(tmp_path / "replay")]) == 0
+    )
+    told += capsys.readouterr().out
+    assert told.count("more policies") == 2 and told.count("\n") < 150
+    assert osel.load_log(tmp_path / "log").policies == tuple(names)

@@ -289,3 +289,27 @@ def test_hard_contexts_are_not_held_against_the_usual_policy():
     rates = np.where(hard[:, None], [0.1, 0.3], [0.7, 0.9])
     chosen = play(make_selector("auto", ("worse", "better"), 6, seed=0), contexts, (generator.random((800, 2)) < rates).astype(float))
     assert (chosen[400:][hard[400:]] == 1).mean() > 0.9
+
+
+@pytest.mark.parametrize(("decisive", "used"), [("first", "first"), ("second", "second"), ("both", "both")])
+def test_evidence_says_which_part_of_a_context_is_used(decisive, used):
+    generator = np.random.default_rng(0)
+    first, second = np.eye(4, 24)[generator.integers(4, size=400)], np.eye(4, 16)[generator.integers(4, size=400)]
+    contexts = np.concatenate([first + 0.05 * generator.normal(size=first.shape), second], axis=1).astype(np.float32)
+    kinds = {"first": first.argmax(axis=1) % 2, "second": second.argmax(axis=1) % 2}
+    kinds["both"] = (kinds["first"] + kinds["second"]) % 2
+    rewards = (generator.random((400, 2)) < np.array([[0.9, 0.2], [0.2, 0.9]])[kinds[decisive]]).astype(float)
+    selector = make_selector("auto", ("a", "b"), 40, seed=0, parts=(24, 16))
+    play(selector, contexts, rewards)
+    assert selector.parts_used == used
+    again = make_selector("auto", ("a", "b"), 40, seed=1, parts=(24, 16))
+    again.load_state_dict(selector.state_dict())
+    assert again.parts_used == used
+    assert again.select(contexts[0]) == selector.select(contexts[0])
+    assert make_selector("auto", ("a", "b"), 40, seed=0).parts_used == "whole"
+
+
+@pytest.mark.parametrize("parts", [(24,), (24, 15), (40, 0), (20, 10, 10)])
+def test_parts_that_are_none(parts):
+    with pytest.raises(UsageError, match="parts"):
+        make_selector("auto", ("a", "b"), 40, seed=0, parts=parts)

@@ -12,6 +12,9 @@ from rich.text import Text
 from osel_sim.core.shown import shown
 from osel_sim.selection.registry import RECOMMENDATION, is_recommended
 
+MOST_POLICIES = 24
+"""Of so many policies a table tells; of more, only of the best. Their outcomes are in the files and on the page."""
+
 
 class SafeConsole(Console):
     """A console on which only rich's own control codes reach the terminal, and none that stands in a text."""

@@ -5,7 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
-from osel_sim.cli.console import Table, number, percent, plain
+from osel_sim.cli.console import MOST_POLICIES, Table, number, percent, plain
 
 
 def print_replay(console: Console, result: Mapping[str, Any]) -> None:
@@ -14,8 +14,12 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
     title = f"{_few(log['tasks'])}: {result['decisions']} decisions of {log['instances']} instances, {len(result['seeds'])} seeds"
     headings = ("mean reward [95%]", "success", "seconds", "cents", "gap closed [95%]", "last quarter [95%]", "regret", "ahead at")
     table = Table(title, [""], headings)
+    fixed = 0
     for name, entry in sorted(result["selectors"].items(), key=lambda item: -item[1]["mean_reward"]):
         if name in ("best_single", "worst_single"):
+            continue
+        fixed += entry["kind"] == "fixed"
+        if entry["kind"] == "fixed" and fixed > MOST_POLICIES:
             continue
         best = result["selectors"]["best_single"]["policy"] == entry.get("policy")
         table.add(
@@ -34,6 +38,8 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
         if name != "best_single":
             table.add(f"{name.replace('_', ' ')} oracle", _with_interval(entry["mean_reward"], entry["ci95"]))
     console.print(table)
+    if fixed > MOST_POLICIES:
+        console.print(f"{fixed - MOST_POLICIES} more policies earn less alone than those shown; selectors.csv has them")
     by = f"gap closed and regret: by the {learnable} oracle; " if learnable else ""
     notes = [f"{by}ahead at: from that decision on the sum of rewards exceeds the best policy's"]
     gains = [f"{name.replace('_', ' ')} {_gain(entry)}" for name, entry in result["oracles"].items() if name != "best_single"]

@@ -1,13 +1,13 @@
 """What a rollout log says: success of every policy, overall and split by object, container and phrasing."""
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 from rich.console import Console
 
-from osel_sim.cli.console import Table, number, percent
+from osel_sim.cli.console import MOST_POLICIES, Table, number, percent
 from osel_sim.formats.levels import label
 from osel_sim.formats.rollout_log import Row
 from osel_sim.interface.outcome import credited
@@ -16,6 +16,8 @@ from osel_sim.selection.reward import RewardWeights, row_rewards, row_seconds
 from osel_sim.statistics.best import share_of_best
 from osel_sim.statistics.intervals import effective_trials, wilson_interval
 
+_MOST_COLUMNS = 12
+"""A column for each of more policies is too narrow to be read."""
 SPLITS: dict[str, Callable[[Row], str | None]] = {
     "task": lambda row: row.task,
     "robot": lambda row: row.robot or DEFAULT_ROBOT,
@@ -35,8 +37,11 @@ def print_rollouts(console: Console, rows: Sequence[Row], weights: RewardWeights
         weights: of the reward.
     """
     policies = list(dict.fromkeys(row.policy for row in rows))
-    console.print(_overall(rows, policies, weights))
-    split = _split(rows, policies)
+    shown = _best(rows, policies, MOST_POLICIES)
+    console.print(_overall(rows, shown, share_best(rows, policies, weights), weights))
+    if len(shown) < len(policies):
+        console.print(f"and {len(policies) - len(shown)} more policies that succeed less often")
+    split = _split(rows, _best(rows, policies, _MOST_COLUMNS))
     if split.row_count:
         console.print(split)
 
@@ -59,7 +64,19 @@ def share_best(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeig
     return dict(zip(policies, shares.tolist(), strict=True)) if complete.any() else {}
 
 
-def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeights) -> Table:
+def _best(rows: Sequence[Row], policies: Sequence[str], most: int) -> Sequence[str]:
+    """The policies that succeed most often, in their order, where there are more than so many."""
+    if len(policies) <= most:
+        return policies
+    successes: dict[str, list[float]] = defaultdict(list)
+    for row in rows:
+        if row.error is None:
+            successes[row.policy].append(credited(row, "success"))
+    best = set(sorted(policies, key=lambda policy: -float(np.mean(successes[policy] or [0.0])))[:most])
+    return [policy for policy in policies if policy in best]
+
+
+def _overall(rows: Sequence[Row], policies: Sequence[str], best: Mapping[str, float], weights: RewardWeights) -> Table:
     instances = len({row.instance for row in rows})
     tasks = {row.task: None for row in rows}
     title = f"{len(tasks)} tasks" if len(tasks) > 1 else next(iter(tasks), "")
@@ -69,7 +86,6 @@ def _overall(rows: Sequence[Row], policies: Sequence[str], weights: RewardWeight
     headings = ["episodes", "success [95%]", *(heading for heading, _ in optional.values()), *(["seconds"] if timed else [])]
     headings += ["mean reward", "best on", "fallbacks", "solved by them", "errors"]
     table = Table(f"{title}: {instances} instances, {len(rows)} episodes", ["policy"], headings)
-    best = share_best(rows, policies, weights)
     for policy in policies:
         own = [row for row in rows if row.policy == policy]
         valid = [row for row in own if row.error is None]
