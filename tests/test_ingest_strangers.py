@@ -315,8 +315,6 @@ def test_dates_are_texts(tmp_path: Path) -> None:
 
 
 def test_logged_decisions_tell_what_others_would_have_earned(tmp_path: Path) -> None:
-    import osel_sim as osel
-
     chance = np.random.default_rng(0)
     lines, weighted = ["q,m,p,s,kind"], {"large": 0.0, "small": 0.0}
     for _ in range(600):

@@ -11,7 +11,7 @@ from osel_sim.analysis.estimate import Estimate, instance_draws, over_instances
 from osel_sim.analysis.gains import Gain, ahead_of, gain_of
 from osel_sim.analysis.log import Array, LoggedOutcomes
 from osel_sim.analysis.oracles import Oracles
-from osel_sim.analysis.outcomes import overall
+from osel_sim.analysis.outcomes import PolicyResult, overall
 from osel_sim.formats.replay_result import Choices
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.statistics.intervals import RESAMPLES, Interval, bootstrap_mean_interval, bootstrap_means
@@ -125,13 +125,16 @@ def measure_selector(log: LoggedOutcomes, choices: Choices, rewards: Curves, nam
     }
 
 
-def measure_fixed(log: LoggedOutcomes, weights: RewardWeights, policy: str) -> dict[str, Any]:
+def measure_fixed(log: LoggedOutcomes, weights: RewardWeights) -> dict[str, dict[str, Any]]:
     """What always one policy comes to: over all repeats of all instances, not those that the streams happened to draw.
 
     Returns:
-        those of a selector's measures (`measure_selector`) of which a log says more than its streams.
+        policy -> those of a selector's measures (`measure_selector`) of which a log says more than its streams.
     """
-    result = next(result for result in overall(log, weights) if result.policy == policy)
+    return {result.policy: _fixed(result) for result in overall(log, weights)}
+
+
+def _fixed(result: PolicyResult) -> dict[str, Any]:
     names = {"success_rate": "success", "mean_subgoals": "subgoals", "mean_score": "score", "mean_steps": "steps", "mean_seconds": "seconds"}
     means = {key: getattr(result, name) for key, name in (names | {"mean_reward": "reward", "mean_price": "price"}).items()}
     found = {key: None if mean is None else mean.value for key, mean in means.items()}

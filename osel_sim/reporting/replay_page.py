@@ -226,7 +226,7 @@ def _streams(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, name
 
 def _as_the_log_tells(result: Mapping[str, Any], log: LoggedOutcomes, weights: RewardWeights) -> dict[str, Any]:
     """The result with what fixed policies come to over all repeats, as the table of policies has it, not over those that the streams drew."""
-    found = {policy: measure_fixed(log, weights, policy) for policy in log.policies}
+    found = measure_fixed(log, weights)
     selectors = {name: {**entry, **found.get(entry.get("policy"), {})} for name, entry in result["selectors"].items()}
     best = found[result["selectors"]["best_single"]["policy"]]
     single = result["oracles"]["best_single"] | {key: best[key] for key in ("mean_reward", "ci95")}

@@ -46,6 +46,10 @@ class Stream:
     chosen: NDArray[np.int64] | None = None
 
 
+_MOST_PANELS = 24
+"""Of so many policies it is drawn how often they are chosen; of more, of those chosen most."""
+
+
 def look_of(names: Sequence[str], policies: Sequence[str], always: Mapping[str, str], keep: Collection[str] = (), learnable: str = "") -> Look:
     """Colours: a fixed policy has its policy's, hindsight and learnable oracle are ink, other oracles muted, all others have one of their own.
 
@@ -158,8 +162,12 @@ def share_figure(streams: Mapping[str, Stream], policies: Sequence[str], look: L
         for policy, share in zip(policies, own, strict=True)
     ]
     text = f"Curves of how often each policy was chosen, a panel for each. At the end: {listed(ends, 12)}."
+    chosen = np.sum([[share.mean() for share in own] for own in shares.values()], axis=0)
+    drawn = sorted(np.argsort(-chosen, kind="stable")[:_MOST_PANELS].tolist())
+    if len(drawn) < len(policies):
+        caption += f" Of {len(policies)} policies these {len(drawn)} were chosen most."
     panels = []
-    for column, policy in enumerate(policies):
+    for column, policy in ((column, policies[column]) for column in drawn):
         lines = [Line(name, own[column][at]) for name, own in shares.items()]
         panels.append(curves(policy, at + 1, lines, look.only(list(shares)), ("decision", "chosen (%)"), (-2.0, 102.0)))
     return Figure("choices", "Who is chosen", caption, text, panels if len(policies) > 2 else panels[1:], look.hidden)
