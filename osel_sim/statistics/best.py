@@ -13,8 +13,9 @@ TIE = 1e-9
 QUANTILES = 32
 """Points of each distribution that the grid begins from, of equal probability between them; three more reach into each tail."""
 
-GRID = 640
-"""Most points of the grid: those of 16 quantities. Of more quantities evenly spaced ones are kept."""
+GRID, COARSE = 640, 192
+"""Most points of the grid, and most where there are more than `MANY` quantities; of more points evenly spaced ones are kept."""
+MANY = 64
 
 
 def probability_of_best(means: Array, deviations: Array) -> Array:
@@ -37,8 +38,9 @@ def probability_of_best(means: Array, deviations: Array) -> Array:
 
     points = (means[:, None] + deviations[:, None] * _quantiles()).ravel()
     points = np.sort(points[points >= (means - _REACH * deviations).max()])  # the highest of all lies below that with next to no probability
-    if len(points) > GRID:
-        points = points[np.linspace(0, len(points) - 1, GRID).astype(np.int64)]
+    most = GRID if len(means) <= MANY else COARSE
+    if len(points) > most:
+        points = points[np.linspace(0, len(points) - 1, most).astype(np.int64)]
     below = ndtr((points - means[:, None]) / deviations[:, None])  # (P, points)
     logarithms = np.log(np.maximum(below, 1e-300))
     others = np.exp(logarithms.sum(axis=0) - logarithms)  # all others lie below the point
