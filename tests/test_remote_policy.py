@@ -193,7 +193,7 @@ def test_a_server_that_is_gone_fails_calls_not_resets(tmp_path):
     remote.reset("x", (2,))
     unreached = remote.call(observation("x"))
     assert "Connection refused" in unreached.failure and unreached.seconds == 2.0
-    assert call.sent is False and unreached.sent is False
+    assert unreached.sent is False  # the first one may have been written before its connection was known to be closed
     remote.close()
 
 

@@ -261,17 +261,17 @@ def test_costs_declared_by_policy_files():
 @pytest.mark.parametrize("name", ["auto", "lints"])
 def test_bad_luck_at_the_beginning_is_overcome(name, failures):
     """A useless context, and the better policy fails the first three times that it is tried: no seed stays with the worse one."""
-    for seed in range(6):
+    for seed in range(4):
         generator = np.random.default_rng(seed)
-        contexts = generator.normal(size=(1000, 4)).astype(np.float32)
-        rewards = (generator.random((1000, 2)) < (0.64, 0.86)).astype(float)
+        contexts = generator.normal(size=(800, 4)).astype(np.float32)
+        rewards = (generator.random((800, 2)) < (0.64, 0.86)).astype(float)
         selector, chosen = make_selector(name, ("worse", "better"), 4, seed), []
         for context, row in zip(contexts, rewards, strict=True):
             choice = selector.select(context)
             chosen.append(choice.policy)
             unlucky = choice.policy == "better" and chosen.count("better") <= failures
             selector.update(context, choice, 0.0 if unlucky else row[int(choice.policy == "better")])
-        assert chosen[-250:].count("worse") < 125
+        assert chosen[-200:].count("worse") < 100
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(0.01, 0.0), (30.0, 0.0), (1.0, 10.0), (0.1, -5.0)])
