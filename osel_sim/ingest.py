@@ -1,6 +1,5 @@
 """Turn outcome tables of others into a rollout log: `python -m osel_sim.ingest --map mapping.toml --out logs/theirs`."""
 
-import shlex
 import sys
 from typing import TYPE_CHECKING
 
@@ -44,6 +43,7 @@ Writes rollouts.parquet and contexts.npz into --out, nothing if the table is wro
 def _execute(config: IngestConfig) -> int:
     from osel_sim.api.ingest import ingest
     from osel_sim.cli.console import console
+    from osel_sim.cli.next_step import print_next
     from osel_sim.cli.rollout_tables import print_rollouts
 
     result = ingest(config)
@@ -53,18 +53,20 @@ def _execute(config: IngestConfig) -> int:
     print(f"{result.folder}: {len(result.rows)} rows, contexts of {result.encoder}, {result.seconds:.0f} s")
     print_rollouts(console(), result.rows, weights)
     print(f"reward ({preset}): {weights.success} - {weights.alpha_time} {weights.time_text} - {weights.alpha_price} cents")
-    print(f"written to {result.folder}; python -m osel_sim.replay {shlex.quote(str(result.folder))}{_flags(result, preset)} replays it to selectors")
+    print(f"written to {result.folder}")
+    print_next(("replays it to selectors: is routing worth it?", "replay", [result.folder, *_flags(result, preset)]))
     return 0
 
 
-def _flags(result: "IngestResult", preset: str) -> str:
+def _flags(result: "IngestResult", preset: str) -> list[object]:
     """Flags for a replay by the same weights, as far as the log knows what they weigh."""
     from osel_sim.api.reward import DEFAULT_PRESET
 
     frame = result.outcomes
-    flags = "" if preset == DEFAULT_PRESET else f" --preset {preset}"
-    flags += " --alpha-time 0" if frame[["steps", "upload", "inference", "download", "motion"]].isna().all(axis=None) else ""
-    return flags + (" --alpha-price 0" if frame["price"].isna().all() else "")
+    flags: list[object] = [] if preset == DEFAULT_PRESET else ["--preset", preset]
+    if frame[["steps", "upload", "inference", "download", "motion"]].isna().all(axis=None):
+        flags += ["--alpha-time", 0]
+    return [*flags, "--alpha-price", 0] if frame["price"].isna().all() else flags
 
 
 main = Command("ingest", IngestConfig, _execute, EXAMPLES)
