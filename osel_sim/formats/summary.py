@@ -29,14 +29,14 @@ def summarise(decisions: Sequence[Decision], policies: Sequence[str], selector: 
 
 
 def check_summary(folder: Path, decisions: int) -> None:
-    """Refuse a journal with fewer decisions than the summary beside it was made of.
+    """Refuse an empty journal beside the summary of one that was not.
 
     Raises:
         DataError: naming both.
     """
     file = folder / SUMMARY
     summed = read_json(file).get("decisions") if file.exists() else None
-    if isinstance(summed, int) and summed > decisions:
+    if isinstance(summed, int) and summed > decisions == 0:
         raise DataError(f"{file} is of {summed} decisions, {JOURNAL} beside it has {decisions}: {LOST}")
 
 
