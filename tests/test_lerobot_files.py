@@ -61,8 +61,8 @@ def png(image: Image.Image) -> dict[str, Any]:
 
 def both(dataset: Path) -> None:
     """Measure, and train on it: as far as reading goes."""
-    open_datasets([dataset], [library.load_policy("local_small")], Measurement(frames=STEPS))
-    load_demonstrations(dataset, ("agentview",), progress=False)
+    assert open_datasets([dataset], [library.load_policy("local_small")], Measurement(frames=STEPS))
+    assert len(load_demonstrations(dataset, ("agentview",), progress=False).state) == 2 * STEPS
 
 
 def test_what_is_read_is_what_the_library_reads(written: Path) -> None:

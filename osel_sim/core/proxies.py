@@ -2,19 +2,15 @@
 
 import ipaddress
 import os
-import urllib.request
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from urllib.parse import urlsplit
 
 from osel_sim.core.shown import shown
 
 VARIABLES = ("WS_PROXY", "WSS_PROXY", "SOCKS_PROXY", "HTTPS_PROXY", "HTTP_PROXY", "ALL_PROXY", "NO_PROXY")
 """All that HTTP and WebSocket clients look at, in small letters as well."""
 CERTIFICATES = ("SSL_CERT_FILE", "SSL_CERT_DIR")
-_ORDER = {"ws": ("ws", "socks", "https", "http"), "wss": ("wss", "socks", "https")}
-"""RFC 6455, section 4.1: SOCKS before HTTPS before HTTP; one for WebSockets alone before all."""
 
 
 @dataclass(frozen=True)
@@ -39,23 +35,22 @@ class Proxy:
 
 
 def proxy_for(url: str) -> Proxy | None:
-    """The proxy that a connection to a WebSocket address goes through.
+    """The proxy that a connection to a WebSocket address goes through, as `websockets` chooses it.
 
     None for this machine, and for what NO_PROXY excepts: names, addresses, networks.
     """
+    from websockets.exceptions import InvalidURI
+    from websockets.proxy import get_proxy
+    from websockets.uri import parse_uri
+
     try:
-        parts = urlsplit(url)
-    except ValueError:  # no address: whoever connects says so
+        uri = parse_uri(url)
+    except (InvalidURI, ValueError):  # no address: whoever connects says so
         return None
-    host = parts.hostname or ""
-    if is_loopback(host) or _excepted(host, f"{parts.netloc.rpartition('@')[2]}"):
+    if is_loopback(uri.host) or _within_excepted(uri.host):
         return None
-    found = urllib.request.getproxies()
-    for scheme in _ORDER.get(parts.scheme, ()):
-        address = found.get(scheme)
-        if address:
-            return Proxy(address if "://" in address else f"http://{address}", _variable(f"{scheme}_proxy"))
-    return None
+    address = get_proxy(uri)
+    return None if address is None else Proxy(address if "://" in address else f"http://{address}", _variable(address))
 
 
 def settings(environment: Mapping[str, str] = os.environ) -> list[str]:
@@ -72,9 +67,7 @@ def is_loopback(host: str) -> bool:
     return host == "localhost"
 
 
-def _excepted(host: str, place: str) -> bool:
-    if urllib.request.proxy_bypass(place):
-        return True
+def _within_excepted(host: str) -> bool:
     said = os.environ.get("no_proxy") or os.environ.get("NO_PROXY") or ""
     return any(_within(host, entry.strip().strip("[]")) for entry in said.split(","))
 
@@ -86,6 +79,8 @@ def _within(host: str, network: str) -> bool:
     return False
 
 
-def _variable(name: str) -> str:
-    """As the environment spells it; else where the operating system keeps it."""
-    return next((spelt for spelt in (name, name.upper()) if os.environ.get(spelt)), "of the system's settings")
+def _variable(address: str) -> str:
+    """That names a proxy; as the environment spells it."""
+    place = address.rpartition("://")[2]
+    spelt = (name for variable in VARIABLES for name in (variable.lower(), variable))
+    return next((name for name in spelt if os.environ.get(name, "").rpartition("://")[2] == place), "of the system's settings")

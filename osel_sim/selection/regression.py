@@ -99,7 +99,7 @@ class SharedRegression:
 
 
 def fit(moments: Moments, prior: Array, shared: Sequence[Array]) -> list[SharedRegression]:
-    """A regression for each of some prior variances of the shared weights.
+    """A regression for each of some prior variances of the shared weights. They share arrays: `update` one of them only.
 
     Args:
         moments: of the observations.
@@ -126,7 +126,7 @@ def fit(moments: Moments, prior: Array, shared: Sequence[Array]) -> list[SharedR
         covariance = roots[:, None] * np.linalg.inv(scaled) * roots
         noise = (NOISE_WEIGHT + max(unexplained - float(information @ covariance @ information), 0.0)) / count
         evidence = -0.5 * (log_determinant + _log_determinants(scaled)) - 0.5 * count * math.log(noise)
-        found.append(SharedRegression(prior, means.copy(), covariances.copy(), covariance, information.copy(), noise, evidence))
+        found.append(SharedRegression(prior, means, covariances, covariance, information, noise, evidence))
     return found
 
 

@@ -11,7 +11,13 @@ TIE = 1e-9
 """Values that differ by no more are equal: the same reward comes out differently in the last bits when it is a mean of other repeats."""
 
 QUANTILES = 32
-"""Points of each distribution that the grid begins from, of equal probability between them; three more reach into each tail."""
+"""Points of each distribution that the grid begins from, of equal probability between them."""
+
+TAILS = (3.5, 4.5, 6.0)
+"""Deviations from the mean that the grid reaches into each tail."""
+
+REACH = 5.0
+"""Deviations within which a quantity lies for certain."""
 
 GRID, COARSE = 640, 192
 """Most points of the grid, and most where there are more than `MANY` quantities; of more points evenly spaced ones are kept."""
@@ -37,7 +43,7 @@ def probability_of_best(means: Array, deviations: Array) -> Array:
     from scipy.special import ndtr
 
     points = (means[:, None] + deviations[:, None] * _quantiles()).ravel()
-    points = np.sort(points[points >= (means - _REACH * deviations).max()])  # the highest of all lies below that with next to no probability
+    points = np.sort(points[points >= (means - REACH * deviations).max()])  # the highest of all lies below that with next to no probability
     most = GRID if len(means) <= MANY else COARSE
     if len(points) > most:
         points = points[np.linspace(0, len(points) - 1, most).astype(np.int64)]
@@ -67,14 +73,10 @@ def share_of_best(values: ArrayLike) -> Array:
     return np.asarray((best / best.sum(axis=1, keepdims=True)).mean(axis=0) if len(best) else np.full(best.shape[1], np.nan), np.float64)
 
 
-_TAILS = (3.5, 4.5, 6.0)
-_REACH = 5.0
-
-
 @cache
 def _quantiles() -> Array:
     """Where the grid begins from, in deviations from the mean."""
     from scipy.special import ndtri
 
     middles = ndtri((np.arange(QUANTILES) + 0.5) / QUANTILES)
-    return np.concatenate([-np.array(_TAILS[::-1]), middles, _TAILS])
+    return np.concatenate([-np.array(TAILS[::-1]), middles, TAILS])
