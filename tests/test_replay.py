@@ -29,7 +29,6 @@ from osel_sim.interface.selector import Choice
 from osel_sim.replay import main as replay_main
 from osel_sim.report import main as report_main
 from osel_sim.selection.reward import RewardWeights
-from osel_sim.statistics.intervals import RESAMPLES
 
 FREE = ["--alpha-time", "0", "--alpha-price", "0", "--workers", "1", "--no-frontier"]
 
@@ -198,15 +197,15 @@ def test_a_log_of_scores_counts_them_as_success_and_is_reported(tmp_path: Path):
 
 
 def test_a_gap_within_its_error_is_not_shared():
-    base = np.random.default_rng(0).random((6, 50))
-    nothing = np.zeros(RESAMPLES)
+    base, order = np.random.default_rng(0).random((6, 50)), np.tile(np.arange(50, dtype=np.int32), (6, 1))
 
     def over(gain: float, error: float) -> Curves:
-        return Curves({}, {"best_single": base, "expected": base + gain}, "expected", 40, nothing, {"expected": Gain(gain, error)}, {})
+        known = {"best_single": base, "expected": base + gain}
+        return Curves({}, known, "expected", order, np.arange(50), 0.0, {"expected": Gain(gain, error)}, {})
 
     share, interval = gap_closed(base + 0.5, over(1.0, 0.1), "expected", 0)
     assert (share, *interval) == pytest.approx((0.5, 0.5, 0.5))
-    for gain, error in ((0.02, 0.02), (0.0, 0.0), (-1.0, 0.1)):
+    for gain, error in ((0.02, 0.02), (0.0, 0.0), (-1.0, 0.1), (0.01, 0.001)):  # the last is surely there, and below the margin
         assert gap_closed(base - 1.0, over(gain, error), "expected", 0) is None
     assert gap_closed(base, over(1.0, 0.1), "predictable", 0) is None  # a selector beat it: it is not among them
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from osel_sim.api.results import ReplayResult
 from osel_sim.api.reward import weights_of
-from osel_sim.api.settings import MAIN, OTHER, Count, Folder, LoggedRewardSettings, Names, settings
+from osel_sim.api.settings import MAIN, OTHER, Count, Folder, LoggedRewardSettings, Names, NonNegative, settings
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
@@ -52,6 +52,10 @@ class ReplayConfig(LoggedRewardSettings):
     """do not tell auto what policies were made for (default: it is told what the log says of it)"""
     no_frontier: Annotated[bool, OTHER] = False
     """do not replay selectors at other weights of time and price as well"""
+    margin: Annotated[NonNegative, OTHER] = 0.02
+    """a gain in reward a decision that is not worth routing for"""
+    route_with: Annotated[Names | None, OTHER] = None
+    """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
     encoder: Annotated[str | None, OTHER] = None
     """whose contexts, where the log has several (default: the one it was recorded with)"""
     context: Annotated[Literal["task"] | None, OTHER] = None
@@ -155,7 +159,8 @@ class _Replay:
                 log, [here], selectors, range(config.seeds), config.decisions, config.workers, bar.update, factories=self.factories
             )
         choices = with_fixed(chosen, best)
-        result = build(log, weights, preset, choices, best, left_out, range(config.seeds))
+        told = config.margin, config.half is not None, config.route_with
+        result = build(log, weights, preset, choices, best, left_out, range(config.seeds), *told)
         result["log"] |= {"half": config.half, "context": config.context}
         result["off_policy"] = off_policy
         result |= _told(here)

@@ -13,6 +13,7 @@ from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.evaluation import evaluate
 from osel_sim.analysis.live import LiveLog, read_live
 from osel_sim.analysis.log import FLAGS, Array, LoggedOutcomes
+from osel_sim.analysis.units import units_of
 from osel_sim.core.errors import DataError
 from osel_sim.formats.journal import Decision
 from osel_sim.formats.run_config import read_run
@@ -53,7 +54,10 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     look = _look(run, streams)
     blocks: list[Block] = [curve_figure(streams, look, run.log.policies)]
     if HINDSIGHT in streams:
-        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look, np.arange(len(run.chosen))[None])]
+        blocks += [
+            regret_figure(streams, [HINDSIGHT], look),
+            penalty_figure(streams, run.weights, look, np.arange(len(run.chosen))[None], units_of(run.log)),
+        ]
     blocks += [_propensities(run), _chosen_table(run, selector)]
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))

@@ -1,0 +1,31 @@
+"""The verdict as a page shows it."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from osel_sim.reporting.page import Tile
+
+TONES: Mapping[str, Literal["good", "neutral"]] = {"route": "good", "do_not_route": "neutral", "not_enough_data": "neutral"}
+
+
+def gain_tiles(found: Mapping[str, Any]) -> list[Tile]:
+    """What the selector has over the best single policy; none where no selector was tested.
+
+    Args:
+        found: as `osel_sim.analysis.verdict.verdict` returns it.
+    """
+    stake = found["stake"]
+    if not stake.get("selector"):
+        return []
+    return [
+        Tile(f"{stake['selector']} over it", _signed(stake["gain"]), f"reward a decision, {_between(stake['gain_bounds'])}"),
+        Tile("in the last quarter", _signed(stake["gain_late"]), f"reward a decision, once it has learned, {_between(stake['gain_late_bounds'])}"),
+    ]
+
+
+def _between(ends: Sequence[float | None]) -> str:
+    return "too few to say more" if None in ends else f"bounds [{ends[0]:.3f}, {ends[1]:.3f}]".replace("-", "\u2212")
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.3f}".replace("-", "\u2212")
