@@ -33,7 +33,8 @@ class Streamed:
         an outcome moves its mean, it moves the reward that is received by x phi(x), where p = Phi(x): nothing where one policy is always chosen or
         where all are equal, most where the choice is made but not settled. Instances of which a selector learned count for more than their own
         rewards, and intervals that leave that out are too narrow: they held the truth in 86 to 92% of simulated logs, with it in 93 to 97%
-        (`benchmarks/verdict.py`). Shares are taken from twice as long a part, where one is that short.
+        (`benchmarks/verdict.py`). Shares are taken from twice as long a part, where one is that short. A share of few decisions is often 0 or 1
+        where the probability is neither: of n decisions x phi(x) comes out too small by about the factor 1 + 3 / n.
 
         Args:
             order: (S, T) instance of every decision, below N.
@@ -45,10 +46,11 @@ class Streamed:
         number = int(order.max()) + 1
         since = first - min(first, order.shape[1] - first)
         counts, longer = (_counts(order[:, start:], chosen[:, start:], number, policies) for start in (first, since))
-        shares = longer / np.maximum(longer.sum(axis=1, keepdims=True), 1.0)
+        drawn = np.maximum(longer.sum(axis=1, keepdims=True), 1.0)
+        shares = longer / drawn
         unsettled = (shares > 0.0) & (shares < 1.0)
         x = ndtri(np.where(unsettled, shares, 0.5))
-        return cls(counts, np.where(unsettled, x * np.exp(-(x**2) / 2.0) / np.sqrt(2.0 * np.pi), 0.0))
+        return cls(counts, np.where(unsettled, (1.0 + 3.0 / drawn) * x * np.exp(-(x**2) / 2.0) / np.sqrt(2.0 * np.pi), 0.0))
 
     def mean(self, table: Array, units: Units, minus: Array | None = None, rare: float = 0.0) -> UnitMean:
         """Mean over decisions and seeds of what the chosen policies came to.

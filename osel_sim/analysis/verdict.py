@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any, Literal
 
@@ -32,6 +32,9 @@ FEWEST = 10
 
 MOST = 1_000_000
 """More instances than that nobody records."""
+
+GROWTH = 1.1
+"""Numbers of instances that might tell are tried in such steps."""
 
 LATE = 0.25
 """The share of a stream's decisions that counts as late: what a selector comes to once it has learned."""
@@ -103,17 +106,28 @@ class Gain:
     """What routing has over always the best single policy, in reward a decision.
 
     Attributes:
-        mean: over the policy that was best on this log.
+        over_best: over the policy that was best on this log.
         low, high: bounds on the gain over the policy that is best, whichever that is; each is wrong with a probability that was asked for.
-        error: standard error.
-        units: of how many.
     """
 
-    mean: float
+    over_best: UnitMean
     low: float
     high: float
-    error: float
-    units: int
+
+    @property
+    def mean(self) -> float:
+        """Over the policy that was best on this log."""
+        return self.over_best.mean
+
+    def of_more(self, times: float) -> UnitMean:
+        """What it would be of so many times as many units, if all else stays."""
+        return replace(self.over_best, units=round(self.over_best.units * times), error=self.over_best.error / math.sqrt(times))
+
+    @property
+    def as_json(self) -> dict[str, Any]:
+        """For a file: None where something is unbounded."""
+        values = {"mean": self.mean, "low": self.low, "high": self.high, "error": self.over_best.error}
+        return {**{key: _finite(value) for key, value in values.items()}, "units": self.over_best.units}
 
 
 def gain(played: Played, name: str, first: int, low_error: float, high_error: float = ERROR) -> Gain:
@@ -123,10 +137,9 @@ def gain(played: Played, name: str, first: int, low_error: float, high_error: fl
     to be wrong); an upper bound the smallest of upper bounds over the policies that may be the best one, who share the error.
     """
     found, may = played.gains(name, first), played.contenders()
-    best = found[played.best]
     low = min(one.mean - one.half(low_error) for one in found)
     high = min(found[column].mean + found[column].half(high_error / len(may)) for column in may)
-    return Gain(best.mean, low, high, best.error, best.units)
+    return Gain(found[played.best], low, high)
 
 
 def verdict(played: Played, tested: Sequence[str], margin: float = MARGIN, error: float | None = None) -> dict[str, Any]:
@@ -146,7 +159,7 @@ def verdict(played: Played, tested: Sequence[str], margin: float = MARGIN, error
     share = error or ERROR / max(1, len(tested))
     late = {name: gain(played, name, played.late, share) for name in tested}
     routed = {name: gain(played, name, 0, share) for name in played.routed}
-    enough = min((found.units for found in late.values()), default=0) >= FEWEST
+    enough = min((found.over_best.units for found in late.values()), default=0) >= FEWEST
     proven = [name for name, found in late.items() if enough and found.low > 0.0]
     best = max(proven or late, key=lambda name: late[name].mean, default=None)
     ceiling = max((found.high for found in (*late.values(), *routed.values())), default=math.inf)
@@ -173,8 +186,8 @@ def verdict(played: Played, tested: Sequence[str], margin: float = MARGIN, error
             "error": ERROR,
             "units": int(played.units.max()) + 1,
             "instances": len(played.units),
-            "advantages": {name: _json(found) for name, found in late.items()},
-            "routers": {name: _json(found) for name, found in routed.items()},
+            "advantages": {name: found.as_json for name, found in late.items()},
+            "routers": {name: found.as_json for name, found in routed.items()},
             "anytime": None if best is None else _anytime(played, best, share),
         },
     }
@@ -203,16 +216,16 @@ def late_from(decisions: int) -> int:
 
 def _more(tested: Iterable[Gain], routed: Iterable[Gain], margin: float, share: float, played: Played) -> int | None:
     """How many more instances would probably tell, one way or the other, if gains are what they seem; None where no number would."""
-    tested, factor = list(tested), _quantile(1.0 - share) + _quantile(POWER)
-    everything = [*tested, *routed]
-    bound = _quantile(1.0 - ERROR / len(played.contenders())) + _quantile(POWER)
-    ways = [found.units * (factor * found.error / found.mean) ** 2 for found in tested if found.mean > 0.0]
-    if all(found.mean < margin for found in everything):
-        ways.append(max((found.units * (bound * found.error / (margin - found.mean)) ** 2 for found in everything), default=math.inf))
-    units = int(played.units.max()) + 1
-    wanted = max(min(ways, default=math.inf), FEWEST, 1.1 * units) - units
-    more = wanted * len(played.units) / units
-    return _rounded(more) if more <= MOST else None
+    tested = list(tested)
+    everything, luck, against = [*tested, *routed], NormalDist().inv_cdf(POWER), ERROR / len(played.contenders())
+    times = max(GROWTH, FEWEST / (int(played.units.max()) + 1))
+    while tested and (more := len(played.units) * (times - 1.0)) <= MOST:
+        grown = [found.of_more(times) for found in everything]
+        proven = any(found.mean > found.half(share) + luck * found.error for found in grown[: len(tested)])
+        if proven or all(found.mean + found.half(against) + luck * found.error < margin for found in grown):
+            return _rounded(more)
+        times *= GROWTH
+    return None
 
 
 def _anytime(played: Played, name: str, error: float) -> dict[str, Any]:
@@ -220,11 +233,6 @@ def _anytime(played: Played, name: str, error: float) -> dict[str, Any]:
     differences = played.rewards[played.order, chosen] - base[played.order]
     low, high = advantage_bounds(differences, played.span, error) if played.span > 0.0 else (0.0, 0.0)
     return {"method": ANYTIME, "selector": name, "mean": float(differences.mean()), "low": low, "high": high}
-
-
-def _json(found: Gain) -> dict[str, Any]:
-    """For a file: None where something is unbounded."""
-    return {key: _finite(value) for key, value in asdict(found).items()}
 
 
 def _finite(value: float) -> float | None:
@@ -235,7 +243,3 @@ def _rounded(value: float) -> int:
     """Up, to two digits."""
     unit = 10.0 ** max(0, math.floor(math.log10(max(value, 1.0))) - 1)
     return round(math.ceil(value / unit) * unit)
-
-
-def _quantile(probability: float) -> float:
-    return NormalDist().inv_cdf(probability)

@@ -36,19 +36,23 @@ def sentences(found: Mapping[str, Any], selector: Measures | None, single: Measu
         limit: what could be gained at most.
     """
     stake = found["stake"]
-    told = [] if selector is None or stake is None else [in_units(stake["selector"], selector, found["policy"], single), _in_reward(stake)]
+    told = (
+        []
+        if selector is None or stake is None
+        else [in_units(f"Routing with {stake['selector']}", selector, found["policy"], single), _in_reward(stake)]
+    )
     return [sentence for sentence in (*told, _reason(found), limit, worth(weights)) if sentence]
 
 
-def in_units(name: str, selector: Measures, policy: str, single: Measures) -> str:
+def in_units(who: str, selector: Measures, policy: str, single: Measures) -> str:
     """`Routing with auto: 77% success at 4.2 cents and 7.8 s, against 76% at 16.8 cents and 8.2 s for always remote_large.`"""
     own, other = _amounts(selector), _amounts(single)
     both = [key for key in own if key in other]
     if not both:
-        return f"Routing with {name}, against always {policy}: nothing but the reward is known of both."
+        return f"{who}, against always {policy}: nothing but the reward is known of both."
     what = {"success_rate": " success", "mean_subgoals": " of the subgoals", "mean_score": " mean score"}
     mine = [own[key] + what.get(key, "") for key in both]
-    return f"Routing with {name}: {_at(mine)}, against {_at([other[key] for key in both])} for always {policy}."
+    return f"{who}: {_at(mine)}, against {_at([other[key] for key in both])} for always {policy}."
 
 
 def worth(weights: RewardWeights) -> str:
@@ -84,7 +88,7 @@ def limit(rewards: "Curves") -> str:
 def _in_reward(stake: Mapping[str, Any]) -> str:
     low, high = stake["gain_late_bounds"]
     return (
-        f"That is {stake['gain']:+.3f} reward a decision while it learns, and {stake['gain_late']:+.3f} in the last quarter, once it has "
+        f"In reward that is {stake['gain']:+.3f} a decision, its learning included, and {stake['gain_late']:+.3f} in the last quarter of its streams "
         f"(between {_bound(low)} and {_bound(high)})."
     )
 

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-COSTS, SKILLS, PARTS = "expected_costs", "skills", "parts"
-"""Settings of selectors that are told what policies cost, what they were made for, and what a context consists of, rather than learn it."""
-
 
 @settings
 class ReplayConfig(LoggedRewardSettings):
@@ -207,19 +204,14 @@ class _Replay:
     def _setups(self, log: "LoggedOutcomes", others: "LoggedOutcomes", selectors: Sequence[str]) -> "Callable[[RewardWeights], Setup]":
         """Under what to replay at any weights: what selectors are told, and shown before their stream begins."""
         from osel_sim.analysis.engine import Setup
+        from osel_sim.analysis.told import told
         from osel_sim.analysis.warm_start import WarmStart
-        from osel_sim.selection.registry import wanted_of
 
-        config = self.config
+        config, named = self.config, [name for name in selectors if name not in self.factories]
 
         def setup(weights: "RewardWeights") -> Setup:
-            known: dict[str, Any] = {} if config.unknown_costs else {COSTS: others.expected_costs(weights)}
-            if log.skills is not None and not config.unknown_skills:
-                known[SKILLS] = log.skills
-            if log.parts:
-                known[PARTS] = log.parts
             warm_start = WarmStart(others.contexts, others.rewards(weights)) if config.half else None
-            return Setup(weights, {name: wanted_of(name, known) for name in selectors if name not in self.factories}, warm_start)
+            return Setup(weights, told(log, others, weights, named, not config.unknown_costs, not config.unknown_skills), warm_start)
 
         return setup
 
@@ -250,6 +242,8 @@ class _Replay:
 
 def _told(setup: "Setup") -> dict[str, Any]:
     """What selectors were told, as `replay.json` has it."""
+    from osel_sim.analysis.told import COSTS, SKILLS
+
     told = setup.settings.values()
     skills = next((settings[SKILLS] for settings in told if SKILLS in settings), None)
     return {
