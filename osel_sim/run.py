@@ -27,11 +27,13 @@ Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 def _execute(config: RunConfig) -> int:
     from osel_sim.api.run import run
     from osel_sim.cli.causes import print_causes
-    from osel_sim.cli.console import console, run_table
+    from osel_sim.cli.console import console, plain, run_table
 
     result = run(config)
     if result.journal:
         console().print(run_table(dict(result.summary)))
+        if result.verdict:
+            console().print(plain(result.verdict, "bold"), soft_wrap=True)
         print_causes((decision.policy, f"decision {decision.index}", decision.error) for decision in result.journal if decision.error)
         print(f"written to {result.folder}" + (f"; {result.page} shows it" if result.page else ""))
     _print_next(config, result)

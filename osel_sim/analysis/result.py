@@ -10,7 +10,7 @@ from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.measures import Curves, curves, difference_ends, measure_fixed, measure_selector, paired, played
 from osel_sim.analysis.oracles import Oracles
 from osel_sim.analysis.streams import LeftOut
-from osel_sim.analysis.verdict import MARGIN, tested_of, verdict
+from osel_sim.analysis.verdict import MARGIN, advisable, verdict
 from osel_sim.analysis.verdict_words import headline, limit, sentences
 from osel_sim.analysis.weights_map import AXES
 from osel_sim.formats.replay_result import Choices
@@ -49,7 +49,7 @@ def build(
         choices: with the fixed policies (`with_fixed`).
         margin: a gain in reward a decision below it is not worth routing for.
         halved: whether selectors were shown the log's other half where they start warm.
-        route_with: selectors that the verdict may advise; None: those that we recommend (`osel_sim.analysis.verdict.tested_of`).
+        route_with: selectors that the verdict may advise; None: those that we recommend (`osel_sim.analysis.verdict.advisable`).
 
     Returns:
         log (folder, instances, left_out, policies, repeats, encoder, tasks), reward, seeds, decisions, selectors, oracles, learnable_oracle, paired,
@@ -125,7 +125,7 @@ def _verdict(
     route_with: Sequence[str] | None,
 ) -> dict[str, Any]:
     """The verdict, its words, and what the learnable oracle gains."""
-    tested, error = tested_of(_of_kind(selectors, "learner"), halved, route_with)
+    tested, error = advisable(_of_kind(selectors, "learner"), halved, route_with)
     found = verdict(played(log, weights, choices, best), tested, rewards.margin, error)
     stake = found["stake"] or {}
     one, other = selectors.get(stake.get("selector", "")), selectors[f"fixed:{found['policy']}"]

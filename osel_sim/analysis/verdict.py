@@ -193,7 +193,7 @@ def verdict(played: Played, tested: Sequence[str], margin: float = MARGIN, error
     }
 
 
-def tested_of(learners: Sequence[str], halved: bool, wanted: Sequence[str] | None = None) -> tuple[list[str], float]:
+def advisable(learners: Sequence[str], halved: bool, wanted: Sequence[str] | None = None) -> tuple[list[str], float]:
     """Selectors that a verdict may advise, and the error that each is tested with.
 
     Those that we recommend, of the learners that there are; where none of them is there, whoever left them out meant the others, and all are tested.

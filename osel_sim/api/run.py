@@ -338,7 +338,8 @@ class _Run:
         summary = write_results(live, title(self.tasks), self.config.selector)
         if self.page is not None and self.page.problem is not None:
             logger.warning("no report.html: %s", self.page.problem)
-        return RunResult(live.folder, summary, tuple(live.decisions), self.page.file if self.page else None, interrupted)
+        page, verdict = (self.page.file, self.page.verdict) if self.page else (None, "")
+        return RunResult(live.folder, summary, tuple(live.decisions), page, interrupted, verdict)
 
 
 class _Interrupt:
