@@ -295,7 +295,7 @@ def openpi_file(folder: Path, url: str, mapping: str) -> Path:
     text = (content.root() / "examples" / "policies" / "pi0_libero.toml").read_text()
     head, tail = text[: text.index("[mapping]")], text[text.index("[remote]") :]
     file = folder / "pi0_libero.toml"
-    file.write_text((head + "[mapping]\n" + mapping + tail).replace("ws://127.0.0.1:8000", url).replace("image_size = 224", "image_size = 32"))
+    file.write_text((head + "[mapping]\n" + mapping + tail).replace("ws://127.0.0.1:8000", url).replace("image_size = 256", "image_size = 32"))
     return file
 
 

@@ -27,6 +27,7 @@ from osel_sim.ingestion.write import IngestedInstance
 from osel_sim.interface.encoder import Image
 from osel_sim.interface.policy import Observation
 from osel_sim.interface.specification import specification
+from osel_sim.policy.mapping import turned_over
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,8 @@ class Dataset:
 
     def images(self, frame: int) -> list[Image]:
         """The images of a frame."""
-        return [self._files.image(self._settings.column(camera), frame) for camera in self._cameras]
+        flips = self._settings.mapping.flip
+        return [turned_over(self._files.image(self._settings.column(camera), frame), flips.get(camera)) for camera in self._cameras]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor
 
@@ -29,7 +29,7 @@ from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Actions, Observation, Policy
 from osel_sim.policy import register
 from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors
-from osel_sim.policy.mapping import actions_of, state_of
+from osel_sim.policy.mapping import actions_of, image_of, state_of
 from osel_sim.policy.perception_step import PerceptionStep
 from osel_sim.policy.text import embed
 from osel_sim.policy.trust import check_checkpoint
@@ -106,7 +106,7 @@ class LeRobotPolicy:
         batch: dict[str, Any] = {"task": self._instruction}
         for key, shape in self._images.items():
             size = shape[-2:]
-            batch[key] = _image(observation[f"{OBS_IMAGES}.{self._cameras[key]}"], size) if key in self._cameras else torch.zeros(3, *size)
+            batch[key] = _image(image_of(observation, self._cameras[key], self._mapping), size) if key in self._cameras else torch.zeros(3, *size)
         if config.robot_state_feature is not None:
             batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping, self._environment))
         if self._context is not None:

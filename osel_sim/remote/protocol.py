@@ -17,7 +17,8 @@ from osel_sim.core.shown import TOKEN_VARIABLE as TOKEN_VARIABLE  # where others
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.policy import Observation
-from osel_sim.interface.specification import specification
+from osel_sim.interface.specification import CAMERAS, specification
+from osel_sim.interface.specification import STATE as STATE_PARTS
 from osel_sim.remote.codec import ProtocolError
 
 PROTOCOL = "osel_sim/1"
@@ -41,6 +42,7 @@ class Greeting:
         cameras, image_size: what it wants to be shown (square, pixels).
         action_dim, state_dim: how many numbers its actions have, and the states it wants; 0: no state.
         action: bounds that the server clips actions to; None: clients do. It is not sent.
+        libero: whether clients of openpi's LIBERO example are understood: the environment has the cameras and the state that they send. Not sent.
     """
 
     policy: str
@@ -49,12 +51,14 @@ class Greeting:
     action_dim: int
     state_dim: int
     action: ActionSpec | None = field(default=None, compare=False, repr=False)
+    libero: bool = field(default=False, compare=False, repr=False)
 
     @classmethod
     def of(cls, spec: PolicySpec, environment: EnvironmentSpec | None = None) -> "Greeting":
         """The greeting of the server of one policy file, which drives in an environment; None: one of ours."""
         environment = environment or specification()
-        return cls(spec.name, spec.cameras, spec.image_size, environment.action.dimension, environment.state_size, environment.action)
+        ours = dict(environment.state) == STATE_PARTS and list(environment.state) == list(STATE_PARTS) and set(spec.cameras) <= set(CAMERAS)
+        return cls(spec.name, spec.cameras, spec.image_size, environment.action.dimension, environment.state_size, environment.action, ours)
 
     def to_dict(self) -> dict[str, Any]:
         """The metadata map as it is sent."""
