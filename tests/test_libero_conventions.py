@@ -21,9 +21,10 @@ from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.specification import specification
 from osel_sim.policy.environment_fit import check_environment
+from osel_sim.policy.history import split
 from osel_sim.policy.mapping import grip_orientation, hand_orientation, image_of, message_of
-from osel_sim.remote.codec import unpack
-from osel_sim.remote.protocol import Greeting
+from osel_sim.remote.codec import pack, unpack
+from osel_sim.remote.protocol import Greeting, ObservationError, example_observation
 from osel_sim.remote.server import Session
 from osel_sim.sim.env import TaskEnv
 
@@ -196,8 +197,6 @@ def test_a_libero_client_is_served(session: tuple[Session, Seen], moments: list[
     ],
 )
 def test_what_a_libero_client_got_wrong_is_named(session: tuple[Session, Seen], change: dict[str, Any], words: str) -> None:
-    from osel_sim.remote.protocol import ObservationError
-
     image = np.zeros((224, 224, 3), np.uint8)
     message = {"observation/image": image, "observation/wrist_image": image, "observation/state": np.zeros(8), "prompt": "lift"}
     with pytest.raises(ObservationError, match=words):
@@ -208,8 +207,19 @@ def test_what_a_libero_client_got_wrong_is_named(session: tuple[Session, Seen], 
 
 
 def test_a_policy_of_another_environment_does_not_take_libero(session: tuple[Session, Seen]) -> None:
-    from osel_sim.remote.protocol import ObservationError
-
     other = EnvironmentSpec("another", 10, ROBOT.action, {"joints": 7}, ROBOT.cameras, "agentview")
     with pytest.raises(ObservationError, match="drives in another environment"):
         Session(Seen(), Greeting.of(example("pi0_libero"), other)).answer(msgpack_numpy.packb({"observation/state": np.zeros(8)}))
+
+
+def test_a_stack_of_observations_is_sent_and_checked_as_one() -> None:
+    spec = replace(example("pi0_libero"), history=2)
+    greeting = Greeting.of(spec, ROBOT)
+    assert Greeting.parse(greeting.to_dict()) == greeting and "history" not in Greeting.of(example("pi0_libero"), ROBOT).to_dict()
+    observation = example_observation(greeting)
+    message = message_of(observation, spec.mapping, spec.cameras, ROBOT)
+    assert (message["observation/image"].shape, message["observation/state"].shape) == ((2, 224, 224, 3), (2, 8))
+    seen = Seen()
+    assert unpack(Session(seen, greeting).answer(pack(observation)))["actions"].shape == (5, 7)
+    with pytest.raises(ObservationError, match=r"must be uint8 of shape \(2, 256, 256, 3\)"):
+        Session(seen, greeting).answer(pack(split(observation)[0]))

@@ -19,6 +19,7 @@ from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.policy import Observation
 from osel_sim.interface.suite import Task
+from osel_sim.policy.history import History, split
 from osel_sim.policy.mapping import image_of, state_of, state_size, wanted_parts
 
 OTHER_INSTRUCTION = "leave everything as it is"
@@ -102,7 +103,9 @@ class _OtherInstruction(Subscriber):
         spec, caller = self._driver.spec, self._driver.caller
         if not spec.is_privileged:
             caller.reset(OTHER_INSTRUCTION, (0,))
-            self.answer = caller.call({**frame.env.observe(spec.cameras, spec.image_size), "task": OTHER_INSTRUCTION})
+            self.answer = caller.call(
+                {**History(spec.history).with_present(frame.env.observe(spec.cameras, spec.image_size)), "task": OTHER_INSTRUCTION}
+            )
 
 
 def find_policy(policy: str, folder: Path | None) -> tuple[PolicySpec, Path | None]:
@@ -149,8 +152,9 @@ def check_policy(spec: PolicySpec, task: Task, seed: int, level: int, out: Path,
     report.calls = len(watched.seen)
     report.outcome = asdict(outcome)
     if watched.seen:
-        _inputs(report, spec, environment, watched.seen[0][0])
-        report.pictures = _pictures(spec, [observation for observation, _ in watched.seen], out)
+        seen = [split(observation)[-1] for observation, _ in watched.seen]
+        _inputs(report, spec, environment, seen[0])
+        report.pictures = _pictures(spec, seen, out)
     _actions(report, environment.action, [call.actions for _, call in watched.seen if call.actions is not None], other.answer)
     _end(report, outcome)
     write_json(out / "report.json", finite(asdict(report)))

@@ -10,6 +10,7 @@ from osel_sim.core.errors import PolicyError
 from osel_sim.formats.conventions import STATE_PARTS, Conventions
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.policy import Observation
+from osel_sim.policy.history import split, stacked
 
 IMAGES, STATE = "observation.images.", "observation.state"
 HAND_TURN = np.pi / 2
@@ -89,7 +90,7 @@ def _turned(axis_angle: NDArray[np.float64], turn: float) -> NDArray[np.float64]
     """Orientations (..., 3) turned about their own z axis, as quaternions (x, y, z, w) with x >= 0, (..., 4)."""
     from scipy.spatial.transform import Rotation
 
-    quaternions = (Rotation.from_rotvec(axis_angle) * Rotation.from_euler("z", turn)).as_quat()
+    quaternions: NDArray[np.float64] = (Rotation.from_rotvec(axis_angle) * Rotation.from_euler("z", turn)).as_quat()
     return np.where(quaternions[..., :1] < 0, -quaternions, quaternions)
 
 
@@ -111,7 +112,9 @@ def _part(parts: dict[str, NDArray[np.float64]], part: str) -> NDArray[np.float6
 
 
 def message_of(observation: Observation, mapping: Conventions, cameras: tuple[str, ...], environment: EnvironmentSpec) -> dict[str, Any]:
-    """An observation under the policy's own names."""
+    """An observation, or a stack of successive ones, under the policy's own names."""
+    if len(single := split(observation)) > 1:
+        return stacked([message_of(one, mapping, cameras, environment) for one in single])
     message: dict[str, Any] = {mapping.key(camera): image_of(observation, camera, mapping) for camera in cameras}
     if cameras:
         message |= {key: np.zeros_like(message[mapping.key(cameras[0])]) for key in mapping.blank}

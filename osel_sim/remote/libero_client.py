@@ -13,14 +13,13 @@ from osel_sim.interface.specification import STATE as STATE_PARTS
 from osel_sim.policy.mapping import grip_orientation
 from osel_sim.remote.protocol import IMAGES, STATE, TASK, Greeting, ObservationError
 
-PREFIX = "observation/"
 CAMERAS = {"observation/image": "agentview", "observation/wrist_image": "wrist"}
 STATE_KEY, PROMPT = "observation/state", "prompt"
 
 
 def is_libero(message: Any) -> bool:
     """Whether a message has that client's names."""
-    return isinstance(message, dict) and any(isinstance(key, str) and key.startswith(PREFIX) for key in message)
+    return isinstance(message, dict) and any(key in message for key in (*CAMERAS, STATE_KEY))
 
 
 def read_libero(message: dict[str, Any], greeting: Greeting) -> Observation:
