@@ -78,7 +78,7 @@ def stream(decisions: int, dim: int):
 def sb3(contexts, rewards, seed: int) -> PPO:
     """The paper's settings in SB3's own loop."""
     env = SelectionEnv(table_rounds(contexts, rewards, in_order=True), POLICIES, contexts.shape[1])
-    settings = {key: value for key, value in PPOSelector(POLICIES, 2, 0, layers=(2,)).settings.items() if key != "layers"}
+    settings = {key: value for key, value in PPOSelector(POLICIES, 2, 0, layers=(2,)).settings.items() if key not in ("layers", "activation")}
     algorithm = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [768, 512, 128, 64, 16]}, seed=seed, device="cpu", **settings)
     return algorithm.learn(len(contexts))
 
