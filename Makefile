@@ -78,7 +78,7 @@ requirements: $(READY)
 environment: $(READY)
 
 # requirements.txt holds the whole closure, hence --no-deps: nothing is resolved a second time.
-$(READY): requirements.txt pyproject.toml
+$(READY): requirements.txt pyproject.toml plugins/lerobot_env_osel_sim/pyproject.toml
 	@python=; for candidate in python3.12 python3.13 python3; do \
 		if $$candidate -c 'import sys, venv; sys.exit(not (3, 12) <= sys.version_info[:2] < (3, 14))' 2>/dev/null; then python=$$candidate; break; fi; \
 	done; \
@@ -87,7 +87,7 @@ $(READY): requirements.txt pyproject.toml
 	[ -x $(PYTHON) ] || $$python -m venv .venv
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check "$$(grep '^uv==' requirements.txt)"
 	.venv/bin/uv pip install --quiet --compile-bytecode --python $(PYTHON) --no-deps -r requirements.txt
-	.venv/bin/uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
+	.venv/bin/uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e . -e plugins/lerobot_env_osel_sim
 	$(PYTHON) -m osel_sim.cli.prepare
 	@touch $@
 
