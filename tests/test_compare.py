@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -119,6 +120,24 @@ def test_logs_that_are_not_of_the_same_scenes_are_refused_by_name(tmp_path, valu
     other = log_of(tmp_path / "other", rows_of("b", [False] * 20, **values), **plain | metadata)
     with pytest.raises(DataError, match=message):
         osel.compare(one, other)
+
+
+def test_pairs_of_other_scenes_are_refused_by_name_and_unknown_ones_said(tmp_path):
+    def scenes(rows: list[Row], changed: range = range(0), known: range = range(20)) -> list[Row]:
+        return [replace(row, scene=f"{row.seed}{'!' if row.seed in changed else ''}" if row.seed in known else None) for row in rows]
+
+    first, second = rows_of("a", [True] * 20), rows_of("b", [False] * 20)
+    one = log_of(tmp_path / "one", scenes(first))
+    for name, changed, message in (("some", range(3, 6), ", nor are 2 others of 20: "), ("single", range(3, 4), ": assets")):
+        other = log_of(tmp_path / name, scenes(second, changed))
+        with pytest.raises(DataError, match=f"'lift/test/0/3' is not the same scene in .*one and in .*{name}{message}"):
+            osel.compare(one, other)
+    same = osel.compare(one, log_of(tmp_path / "same", scenes(second)), markdown=tmp_path / "same.md")
+    assert same.result["pairs"][0]["same_scene"] == 20 and "key alone" not in (tmp_path / "same.md").read_text()
+    half = osel.compare(one, log_of(tmp_path / "half", scenes(second, known=range(15))), markdown=tmp_path / "half.md")
+    assert half.result["pairs"][0]["same_scene"] == 15 and "tell the scenes of 5 of them" in (tmp_path / "half.md").read_text()
+    osel.compare(one, log_of(tmp_path / "old", second), markdown=tmp_path / "old.md")
+    assert "Paired by key alone" in (tmp_path / "old.md").read_text()
 
 
 def test_a_task_that_got_worse_is_named_though_the_whole_did_not(tmp_path):

@@ -61,11 +61,23 @@ class RecordResult:
         folder: of the rollout log.
         recorded: how many episodes were run this time.
         seconds: that it took.
+        comparison: of a recording until decided, as `compare` has it; None of others.
+        instances, planned: of a recording until decided, how many instances it took, and how many there might have been.
+        spared: episodes that were planned and not needed.
     """
 
     folder: Path
     recorded: int = 0
     seconds: float = 0.0
+    comparison: Mapping[str, Any] | None = None
+    instances: int = 0
+    planned: int = 0
+    spared: int = 0
+
+    @property
+    def verdict(self) -> str:
+        """Of a recording until decided: which is better? In words; empty of others."""
+        return str(self.comparison["verdict"]["text"]) if self.comparison else ""
 
     @cached_property
     def rows(self) -> "list[Row]":

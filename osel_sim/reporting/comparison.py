@@ -73,6 +73,14 @@ def notes(entry: Mapping[str, Any]) -> list[str]:
         found.append(
             f"Episodes that ended in error are nobody's failure: {entry['errors']['first']} of {first}, {entry['errors']['second']} of {second}."
         )
+    if entry["looks"]:
+        found.append(
+            f"Stopped by what it showed, after {entry['looks']} looks: the interval and the p of success hold at every one of them, "
+            "those of tasks and other measures are those of a fixed number of instances."
+        )
+    if entry["same_scene"] < entry["instances"]:
+        known = f" of {entry['instances'] - entry['same_scene']} of them" if entry["same_scene"] else ""
+        found.append(f"Paired by key alone: the logs do not tell the scenes{known} (of an earlier version, or from elsewhere).")
     found += [f"No {name}: {reason}." for name, reason in entry["missing"].items()]
     worse = [task for task, part in entry["tasks"].items() if part["decision"] == "worse"]
     if worse and entry["verdict"]["decision"] != "worse":
