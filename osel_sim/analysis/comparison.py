@@ -10,13 +10,11 @@ import numpy as np
 from osel_sim.analysis.log import Array
 from osel_sim.analysis.pairing import MEASURES, Contender, Pairs, pair
 from osel_sim.analysis.until_decided import ERROR, FEWEST
+from osel_sim.formats.compare_schema import EXIT_CODES, Decision
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.statistics.intervals import Interval
 from osel_sim.statistics.paired import Discordance, holm, letters, mean_interval, sign_flip_midp, success_interval
 from osel_sim.statistics.sequential import anytime_bounds, anytime_p, pairs_to_tell
-
-Decision = Literal["better", "worse", "no worse", "not enough data"]
-EXIT_CODES: dict[Decision, int] = {"better": 0, "no worse": 0, "worse": 1, "not enough data": 3}
 
 
 def compare(contenders: Sequence[Contender], weights: RewardWeights, margin: float, power: float = 0.8) -> dict[str, Any]:

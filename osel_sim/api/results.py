@@ -159,6 +159,13 @@ class CompareResult:
         return None if self.folder is None else self.folder / COMPARE
 
     @property
+    def page(self) -> Path | None:
+        """The page beside it; None of a plan."""
+        from osel_sim.reporting.page import PAGE
+
+        return None if self.folder is None or "plan" in self.result else self.folder / PAGE
+
+    @property
     def decision(self) -> str:
         """`better`, `worse`, `no worse` or `not enough data`; empty of a plan. Of several policies that of the first that is found in the order
         worse, not enough data, no worse, better."""
