@@ -26,7 +26,9 @@ class SuiteSpec:
         axes: of perturbation that its levels turn up; a task may allow fewer.
         packages: distributions whose versions `run.json` keeps.
         install: the command that gets it, told where a package is missing.
-        opengl: whether it renders in this process by MuJoCo's OpenGL backend, which `run.json` then keeps and a resumed run must share.
+        opengl: whether it renders by MuJoCo's OpenGL backend, here or in its host, which `run.json` then keeps and a resumed run must share.
+        environments: names of the Python environments of its own that it runs in where it does not fit into this one; none: it always runs here.
+        cannot: what it cannot do, a sentence each.
     """
 
     name: str
@@ -37,6 +39,8 @@ class SuiteSpec:
     packages: tuple[str, ...] = ()
     install: str = ""
     opengl: bool = False
+    environments: tuple[str, ...] = ()
+    cannot: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
