@@ -4,6 +4,7 @@ import contextlib
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from osel_sim.core.errors import MissingPackageError, UnknownNameError, UsageError
@@ -106,6 +107,23 @@ class Prepares(Protocol):
     def prepare(self) -> None:
         """Do it, unless it is done."""
         ...
+
+
+@runtime_checkable
+class TakesFolder(Protocol):
+    """A suite of others to which users add tasks by files: `--tasks DIR` holds them in a folder called as the suite is."""
+
+    def with_files(self, folder: Path) -> "Suite":
+        """The same suite with the files of that folder, `DIR/SUITE`.
+
+        Raises:
+            ContentError: one of them is wrong.
+        """
+        ...
+
+
+NO_SNAPSHOTS = "no snapshots: for every policy the instance is started again from the same seed"
+"""What a suite cannot do, of those that can set up no state but the first."""
 
 
 @dataclass(frozen=True)

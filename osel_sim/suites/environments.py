@@ -46,12 +46,12 @@ class SuiteEnvironment:
     @property
     def python(self) -> Path:
         """Its interpreter."""
-        return self.folder / "bin" / "python"
+        return self._env / "bin" / "python"
 
     @property
     def packages(self) -> Path:
         """The folder of its packages."""
-        return self.folder / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}" / "site-packages"
+        return self._env / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}" / "site-packages"
 
     @property
     def installed(self) -> bool:
@@ -108,10 +108,14 @@ class SuiteEnvironment:
         return self.folder
 
     def _make(self, uv: str) -> None:
-        # --allow-existing: the lock lies in the folder. What an interrupted attempt left is replaced.
-        _run(uv, "venv", "--quiet", "--allow-existing", "--no-project", "--python", sys.executable, str(self.folder))
+        shutil.rmtree(self._env, ignore_errors=True)  # what an interrupted attempt left
+        _run(uv, "venv", "--quiet", "--no-project", "--python", sys.executable, str(self._env))
         _run(uv, "pip", "install", "--quiet", "--python", str(self.python), "--no-deps", "--requirements", str(self._pins))
         (self.folder / READY).touch()
+
+    @property
+    def _env(self) -> Path:
+        return self.folder / "env"  # uv holds a lock of its own in it, called as ours is
 
     @property
     def _pins(self) -> Path:

@@ -173,6 +173,8 @@ def _reply(table: Table, frame: str | bytes) -> bytes:
         return pack(table.answer(message))
     except OselError as error:
         return pack({"refused": str(error)})
+    except ModuleNotFoundError as error:
+        return pack({"missing": (error.name or str(error)).partition(".")[0]})
     except Exception as error:
         traceback.print_exc()
         return pack({"failed": f"{type(error).__name__}: {' '.join(str(error).split())}"[:2000]})

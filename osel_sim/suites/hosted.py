@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection, connect
 
-from osel_sim.core.errors import RemoteError, SuiteHostError, UsageError
+from osel_sim.core.errors import MissingPackageError, RemoteError, SuiteHostError, UsageError
 from osel_sim.interface.environment import Environment, EnvironmentSpec, Image
 from osel_sim.interface.policy import Actions, Observation
 from osel_sim.remote.codec import ProtocolError, pack, unpack
 from osel_sim.remote.process import ServerProcess
+from osel_sim.sim.gl import choose_backend
 from osel_sim.suites.base import PlainInstance
 from osel_sim.suites.environments import SuiteEnvironment, environment
 from osel_sim.suites.host import LARGEST, PROTOCOL, Message, module_of
@@ -74,6 +75,7 @@ class Host(ServerProcess):
 
         Raises:
             HostGoneError: it cannot be started, has ended, or does not answer; the next question starts it again.
+            MissingPackageError: what was asked for needs a package that its environment does not have.
             UsageError: it refuses, since something is wrong with what was asked for.
             SuiteHostError: the simulator failed.
         """
@@ -88,6 +90,9 @@ class Host(ServerProcess):
                 raise self._gone(f"does not answer within {ANSWER_SECONDS:g} s") from None
             except (OSError, WebSocketException, ProtocolError) as error:
                 raise self._gone("has ended" if not self.running else f"hung up ({error})") from None
+        if "missing" in answer:
+            package = answer["missing"]
+            raise MissingPackageError(f"suite {self._suite!r}", package, f"uv pip install --python {self._where.python} {package}")
         if "refused" in answer:
             raise UsageError(answer["refused"])
         if "failed" in answer:
@@ -277,33 +282,40 @@ class HostedExpert:
         return self._env.act()
 
 
-def open_environment(suite: str, task: str, where: str | None = None) -> Environment:
+def open_environment(suite: str, task: str, place: str | None = None, here: bool = False) -> Environment:
     """Make the environment of a task: in this process where what the suite needs is installed here, else in its host.
 
     Args:
         suite: package below `osel_sim.suites`.
         task: its name within the suite.
-        where: the Python environment, where it is not called as the suite is.
+        place: its Python environment, where that is not called as the suite is.
+        here: in this process in any case.
 
     Raises:
         MissingPackageError: it is neither here nor has been made.
         SuiteHostError: the host cannot be started, or the simulator fails.
     """
-    place = environment(where or suite)
-    place.require(suite)
-    if place.here:
+    host = _host(suite, place, here)
+    if host is None:
         made: Environment = module_of(suite).open_environment(task)
         return made
-    return HostedEnvironment(host_of(suite, place.name), task)
+    return HostedEnvironment(host, task)
 
 
-def describe(suite: str, task: str, where: str | None = None) -> Message:
+def describe(suite: str, task: str, place: str | None = None, here: bool = False) -> Message:
     """What only the simulator knows of a task, as plain data (`describe` of the suite's module). Arguments and errors as `open_environment`."""
-    place = environment(where or suite)
-    place.require(suite)
-    if place.here:
-        return dict(module_of(suite).describe(task))
-    return dict(host_of(suite, place.name).ask({"do": "describe", "task": task})["description"])
+    host = _host(suite, place, here)
+    return dict(module_of(suite).describe(task) if host is None else host.ask({"do": "describe", "task": task})["description"])
+
+
+def _host(suite: str, place: str | None, here: bool) -> Host | None:
+    """The host that a suite runs in; None: this process."""
+    choose_backend()  # before MuJoCo is imported, here or there: it looks only once
+    where = environment(place or suite)
+    if here or where.here:
+        return None
+    where.require(suite)
+    return host_of(suite, where.name)
 
 
 def _bytes(frame: str | bytes) -> bytes:

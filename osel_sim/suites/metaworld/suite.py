@@ -17,6 +17,7 @@ from osel_sim.suites.base import PlainInstance
 from osel_sim.suites.environments import environment
 from osel_sim.suites.hosted import open_environment
 from osel_sim.suites.metaworld.tasks import AXES, HORIZON, SPECIFICATION, TABLE_TOPS, load_tasks
+from osel_sim.suites.phrasing import phrase, stream
 
 NAME = "metaworld"
 TABLE_TINT = (0.0, 0.1, 0.2, 0.3)
@@ -53,31 +54,21 @@ class Metaworld:
 
     def instance(self, task: str, seed: int, level: int, split: str, axes: Mapping[str, int]) -> PlainInstance:
         """Draw an instance. Training and validation instructions use the training phrasings; half of the test instructions use held-out ones."""
+        from osel_sim.sim.perturbation import HELD_OUT
+
         levels = resolve(level, axes, AXES, f"{NAME}:{task}")
-        scene = [int(content_digest(task)[:8], 16), SPLITS.index(split), seed]
 
-        def stream(axis: str) -> np.random.Generator:
-            return np.random.default_rng([*scene, int(content_digest(axis)[:8], 16), levels[axis]])
+        def of(axis: str) -> np.random.Generator:
+            return stream(task, seed, split, int(content_digest(axis)[:8], 16), levels[axis])
 
-        phrasing, instruction = _phrase(task, split, levels["phrasing"], np.random.default_rng(scene), stream("phrasing"))
+        text, more = load_tasks()[task], HELD_OUT[levels["phrasing"]]
+        phrasing, instruction = phrase(text.train, text.held_out, split, stream(task, seed, split), more, of("phrasing"))
         lowest, above = split_off(levels)
-        return PlainInstance(f"{NAME}:{task}", seed, split, instruction, lowest, above, phrasing, details=_details(levels, stream))
+        return PlainInstance(f"{NAME}:{task}", seed, split, instruction, lowest, above, phrasing, details=_details(levels, of))
 
     def open(self, task: str) -> Environment:
         """Make the environment of a task."""
         return open_environment(NAME, task)
-
-
-def _phrase(task: str, split: str, level: int, rng: np.random.Generator, other: np.random.Generator) -> tuple[str, str]:
-    """Which phrasing, and the instruction."""
-    from osel_sim.sim.perturbation import HELD_OUT
-
-    text = load_tasks()[task]
-    held_out = split == "test" and bool(rng.random() < 0.5)
-    number = int(rng.integers(len(text.held_out if held_out else text.train)))
-    if split == "test" and not held_out and other.random() < HELD_OUT[level]:
-        held_out, number = True, int(other.integers(len(text.held_out)))
-    return f"{'held_out' if held_out else 'train'}-{number}", (text.held_out if held_out else text.train)[number]
 
 
 def _details(levels: Mapping[str, int], stream: Any) -> dict[str, Any]:
