@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from osel_sim.core.errors import SuiteHostError
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.call import Call, Caller, Privileged
 from osel_sim.interface.environment import ActionSpec, Environment, TakesChunks
@@ -116,8 +117,9 @@ def run_episode(
             failure = episode.drive(fallback, episode_seed(instance.key, fallback.spec.name, repeat))
         error = None if failure is None else f"{episode.policy}: {failure}"
     except Exception as problem:
-        if episode.telling:
+        if episode.telling and not isinstance(problem, SuiteHostError):  # a simulator that ended may be noticed by a video first
             raise  # a subscriber's trouble (a full disk) is none of the policy's
+        episode.telling = False
         error = f"{episode.policy}: {type(problem).__name__}: {' '.join(str(problem).split())}"
     outcome = episode.outcome(fallback_reason, error)
     for subscriber in subscribers:
