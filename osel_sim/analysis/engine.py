@@ -1,5 +1,6 @@
 """Replays of selectors over streams of a log, in processes; the result does not depend on how many."""
 
+import os
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.streams import Streams, draw_streams
@@ -17,7 +19,6 @@ from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
 from osel_sim.interface.selector import SelectorFactory
-from osel_sim.selection.ppo.compiled import prepare
 from osel_sim.selection.reward import RewardWeights
 
 WARM = ":warm"
@@ -105,8 +106,6 @@ def replay(
         if warm and any(setup.warm_start is None for setup in part.setups):
             raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to start warm with")
     materials = [_material(part) for part in parts]
-    if any({"ppo", "ppo_tuned"} & set(part.selectors) for part in parts):
-        prepare()  # here, once, rather than in every worker
     return _collected(parts, materials, workers, progress or (lambda decisions: None), factories or {})
 
 
@@ -207,8 +206,9 @@ def _run(
 
 
 def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
-    """What a worker does."""
-    _limit_threads()
+    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+    threadpool_limits(1)
     return lambda job, _: [_replay_job(materials, factories, job)]
 
 
@@ -224,22 +224,15 @@ def _replay_job(materials: Sequence[_Material], factories: Mapping[str, Selector
     return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, **setup.settings.get(name, {}))
 
 
-def _limit_threads() -> Any:
-    """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
-    import torch
-    from threadpoolctl import threadpool_limits
-
-    torch.set_num_threads(1)
-    return threadpool_limits(1)
-
-
 @contextmanager
 def _one_thread() -> Iterator[None]:
+    """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
     import torch
 
     threads = torch.get_num_threads()
     try:
-        with _limit_threads():
+        torch.set_num_threads(1)
+        with threadpool_limits(1):
             yield
     finally:
         torch.set_num_threads(threads)

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -156,18 +157,21 @@ class _Replay:
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
         here = setup(weights)
-        best = oracles(log, weights)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
         parts = [*stages, *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
-        with progress(sum(part.total for part in parts), "decision", scale=True) as bar:
+        with progress(sum(part.total for part in parts), "decision", scale=True) as bar, ThreadPoolExecutor(1) as beside:
+            bounds = beside.submit(oracles, log, weights)  # while workers begin
+            if config.workers == 1:
+                bounds.result()  # what is replayed in this process limits its threads, on which last bits depend
             for part, made in zip(parts, replay_parts(parts, config.workers, bar.update, self.factories), strict=True):
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}
+                    best = bounds.result()
                     choices = with_fixed(replace(made[0], chosen=known), best)
                     result = build(log, weights, preset, choices, best, left_out, seeds)
                     result["log"] |= {"half": config.half, "context": config.context}
