@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 from synthetic_log import clusters, make_row, write_log
 
-from osel_sim.analysis.engine import Part, Setup
+from osel_sim.analysis.engine import Part, Setup, replay_parts
 from osel_sim.analysis.engine import replay as replay_all
 from osel_sim.analysis.gains import Gain
 from osel_sim.analysis.log import read_log
@@ -286,7 +286,7 @@ def test_workers_do_not_matter(log):
     outcomes = read_log(log)
     setups = [Setup(RewardWeights(0.0, 0.0)), Setup(RewardWeights(0.1, 0.0), {"linucb": {"optimism": 5.0}})]
     parts = [Part(outcomes, setups, names, range(2), 90), Part(outcomes, setups[1:], ["thompson"], range(1), 20)]
-    (one, last), (two, again) = (list(replay_all(parts, workers)) for workers in (1, 2))
+    (one, last), (two, again) = (list(replay_parts(parts, workers)) for workers in (1, 2))
     assert (last[0].chosen["thompson"] == again[0].chosen["thompson"]).all()
     for number in range(2):
         assert (one[number].order == two[number].order).all()
@@ -296,13 +296,13 @@ def test_workers_do_not_matter(log):
 
 def test_a_selector_sees_the_outcomes_of_its_choices_only(log, monkeypatch):
     outcomes = read_log(log)
-    [[first]] = replay_all([Part(outcomes, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)])
+    (first,) = replay_all(outcomes, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)
     chosen = np.zeros_like(outcomes.success, bool)
     rows = first.order[0]
     chosen[rows, first.chosen["linucb"][0], 0] = True
     other = read_log(log)
     other.success[~chosen] = 1.0 - other.success[~chosen]
-    [[again]] = replay_all([Part(other, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)])
+    (again,) = replay_all(other, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)
     assert (again.chosen["linucb"] == first.chosen["linucb"]).all()
 
 

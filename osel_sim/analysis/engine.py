@@ -24,7 +24,7 @@ from osel_sim.selection.reward import RewardWeights
 WARM = ":warm"
 """Ending of the name of a selector that is shown all outcomes of other instances before its stream begins."""
 
-SLOW_FIRST = ("ppo", "auto:warm", "auto", "neural_linear", "ppo_tuned", "vw_regcb", "vw_squarecb")
+SLOW_FIRST = ("ppo", "neural_linear", "auto:warm", "auto", "ppo_tuned", "vw_regcb", "vw_squarecb")
 """Selectors whose replays take longest are begun first, so that no worker is left with a long one at the end."""
 
 
@@ -83,12 +83,20 @@ _Job = tuple[int, int, str, int]
 
 
 def replay(
+    log: LoggedOutcomes, setups: Sequence[Setup], selectors: Sequence[str], seeds: Sequence[int], decisions: int | None = None, workers: int = 1
+) -> list[Choices]:
+    """Replay one part, whose attributes these are: the choices under each of its setups. See `replay_parts`."""
+    [choices] = replay_parts([Part(log, setups, selectors, seeds, decisions)], workers)
+    return choices
+
+
+def replay_parts(
     parts: Sequence[Part],
     workers: int = 1,
     progress: Callable[[int], Any] | None = None,
     factories: Mapping[str, SelectorFactory] | None = None,
-) -> Iterator[list[Choices]]:
-    """Replay parts in turn, with one set of workers: while the end of one is waited for, the next is begun.
+) -> Generator[list[Choices]]:
+    """Replay parts in turn, with one set of workers: while the end of one is waited for, the next is begun. Close the iterator to end them.
 
     Args:
         workers: processes; with 1 it happens in this one.
@@ -117,7 +125,7 @@ def _material(part: Part) -> _Material:
 
 def _collected(
     parts: Sequence[Part], materials: Sequence[_Material], workers: int, count: Callable[[int], Any], factories: Mapping[str, SelectorFactory]
-) -> Iterator[list[Choices]]:
+) -> Generator[list[Choices]]:
     """Put what comes of the jobs together, part by part."""
     jobs: list[_Job] = [
         (number, at, name, seed)

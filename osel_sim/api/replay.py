@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -144,8 +145,7 @@ class _Replay:
         off_policy: dict[str, Any] | None = None,
     ) -> ReplayResult:
         """Replay stage by stage: what a verdict needs, all other selectors, and again at other weights. Each is written and told."""
-        from osel_sim.analysis.engine import Part
-        from osel_sim.analysis.engine import replay as replay_parts
+        from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import build, tables, with_fixed
         from osel_sim.core.progress import progress
@@ -161,11 +161,15 @@ class _Replay:
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
         parts = [*stages, *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
-        with progress(sum(part.total for part in parts), "decision", scale=True) as bar, ThreadPoolExecutor(1) as beside:
+        with (
+            progress(sum(part.total for part in parts), "decision", scale=True) as bar,
+            closing(replay_parts(parts, config.workers, bar.update, self.factories)) as replayed,
+            ThreadPoolExecutor(1) as beside,
+        ):
             bounds = beside.submit(oracles, log, weights)  # while workers begin
             if config.workers == 1:
                 bounds.result()  # what is replayed in this process limits its threads, on which last bits depend
-            for part, made in zip(parts, replay_parts(parts, config.workers, bar.update, self.factories), strict=True):
+            for part, made in zip(parts, replayed, strict=True):
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
                 else:
