@@ -2,6 +2,8 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -144,8 +146,7 @@ class _Replay:
         off_policy: dict[str, Any] | None = None,
     ) -> ReplayResult:
         """Replay stage by stage: what a verdict needs, all other selectors, and again at other weights. Each is written and told."""
-        from osel_sim.analysis.engine import Part
-        from osel_sim.analysis.engine import replay as replay_parts
+        from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import build, tables, with_fixed
         from osel_sim.core.progress import progress
@@ -157,18 +158,25 @@ class _Replay:
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
         here = setup(weights)
-        best = oracles(log, weights)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
         parts = [*stages, *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
-        with progress(sum(part.total for part in parts), "decision", scale=True) as bar:
-            for part, made in zip(parts, replay_parts(parts, config.workers, bar.update, self.factories), strict=True):
+        with (
+            progress(sum(part.total for part in parts), "decision", scale=True) as bar,
+            closing(replay_parts(parts, config.workers, bar.update, self.factories)) as replayed,
+            ThreadPoolExecutor(1) as beside,
+        ):
+            bounds = beside.submit(oracles, log, weights)  # while workers begin
+            if config.workers == 1:
+                bounds.result()  # what is replayed in this process limits its threads, on which last bits depend
+            for part, made in zip(parts, replayed, strict=True):
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}
+                    best = bounds.result()
                     choices = with_fixed(replace(made[0], chosen=known), best)
                     result = build(log, weights, preset, choices, best, left_out, seeds, config.margin, config.half is not None, config.route_with)
                     result["log"] |= {"half": config.half, "context": config.context}
