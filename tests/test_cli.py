@@ -194,6 +194,8 @@ def test_list_and_help_are_quick_and_import_nothing_heavy(flag: str, tmp_path: P
         done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
         end = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds.append(end.ru_utime - start.ru_utime + end.ru_stime - start.ru_stime)
+        if seconds[-1] < 1.5:
+            break
     assert min(seconds) < 1.5
     assert done.returncode == 0
     imported = {line.rpartition("|")[2].strip().partition(".")[0] for line in done.stderr.splitlines()}
