@@ -102,6 +102,7 @@ def test_every_policy_on_every_instance_from_the_same_state(reference):
     remote = [row for row in rows if row.policy == "wild"]
     assert len({row.upload for row in remote}) == len(remote), "each episode has its own network"
     assert metadata["encoder"] == "colours"
+    assert len({(row.instance, row.scene) for row in rows}) == len({row.scene for row in rows}) == INSTANCES
     contexts = ContextCache(folder).table("colours", [row.instance for row in rows[:: 2 * REPEATS]])
     assert contexts.shape == (INSTANCES, 53)
     assert len(np.unique(contexts, axis=0)) == INSTANCES
@@ -193,6 +194,20 @@ def test_a_log_knows_what_its_policies_declare(world, reference):
     (own / "wild.toml").write_text((own / "wild.toml").read_text().replace('"short"', '"shrt"'))
     assert record_main([*arguments[:1], "--out", str(world / "undeclared"), "--task", "short", *arguments[3:], "--policies", "wild"][1:]) == 2
     assert not (world / "undeclared").exists()
+
+
+def test_a_policy_is_not_added_to_other_scenes(world, reference):
+    folder = world / "other scenes"
+    shutil.copytree(reference[0], folder)
+    rows, metadata = read_rollouts(folder)
+    assert rows[0].scene is not None
+    changed = [dataclasses.replace(row, scene="0123456789abcdef") if row.seed == 41 else row for row in rows if row.policy == "calm"]
+    write_rollouts(folder, changed, {key: value for key, value in metadata.items() if key != "schema_version"})
+    before = files(folder)
+    done = resume(world, folder)
+    assert done.returncode == 2
+    assert "instance 'short/test/0/41' now has another scene than in the episodes that are there" in done.stderr
+    assert files(folder) == before
 
 
 def test_a_policy_that_cannot_be_added_leaves_the_log_as_it_was(world, reference, capsys):
