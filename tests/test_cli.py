@@ -203,11 +203,11 @@ def test_list_and_help_are_quick_and_import_nothing_heavy(flag: str, tmp_path: P
     assert not imported & {"torch", "mujoco", "robosuite", "gymnasium", "stable_baselines3", "open_clip", "lerobot", "matplotlib", "numba", "numpy"}
 
 
-def test_a_list_names_tasks_and_policies() -> None:
-    table, data = (
-        subprocess.run([sys.executable, "-m", "osel_sim.run", *flags], capture_output=True, text=True).stdout
-        for flags in (["--list"], ["--list", "--json"])
-    )
+def test_a_list_names_tasks_and_policies(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--list"]) == 0
+    table = capsys.readouterr().out
+    assert main(["run", "--list", "--json"]) == 0
+    data = capsys.readouterr().out
     for name in ("pick_place", "local_small", "remote_large"):
         assert name in table
     listed = json.loads(data)
