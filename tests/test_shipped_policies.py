@@ -20,7 +20,12 @@ INSTANCES = 12
 
 @pytest.mark.parametrize(
     ("name", "task", "at_least"),
-    [("local_small", "pick_place", 3), ("remote_base", "pick_place", 7), ("remote_large", "pick_place", 8), ("remote_specialist", "open_drawer", 8)],
+    [
+        ("local_small", "pick_place", 3),
+        ("remote_specialist", "open_drawer", 8),
+        pytest.param("remote_base", "pick_place", 7, marks=pytest.mark.slow),
+        pytest.param("remote_large", "pick_place", 8, marks=pytest.mark.slow),
+    ],
 )
 def test_solves_unseen_instances(name, task, at_least):
     env = TaskEnv(task)
