@@ -1,6 +1,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -160,6 +161,42 @@ def test_images_are_the_same_each_time_and_differ_between_scenes(env):
         assert first[key].shape == (64, 64, 3) and first[key].dtype == np.uint8
     assert first["observation.state"].shape == (8,) and np.isfinite(first["observation.state"]).all()
     assert first["task"] == make_instance(env.task, 1).instruction
+
+
+def test_a_scene_is_told_by_all_that_an_episode_depends_on(env):
+    task = env.task
+    plain = make_instance(task, 3)
+    env.load(plain)
+    digest, world = env.scene_digest(), env.world
+    env.advance(np.ones(7))
+    assert env.scene_digest() == digest, "what happens later is not how it began"
+    twin = TaskEnv(task)
+    twin.load(make_instance(task, 4))
+    snapshot = twin.snapshot()
+    other = twin.scene_digest()
+    twin.load(plain)
+    assert twin.scene_digest() == digest != other
+    twin.restore(snapshot)
+    assert twin.scene_digest() == other
+    twin.close()
+    moved = replace(plain, placements=(replace(plain.placements[0], x=plain.placements[0].x + 1e-4), *plain.placements[1:]))
+    last_bits = replace(plain, placements=(replace(plain.placements[0], x=plain.placements[0].x + 1e-15), *plain.placements[1:]))
+    named = replace(plain, instruction="do something else")
+    perturbed = [make_instance(task, 3, axes={axis: 3}) for axis in task.axes if axis != "phrasing"]
+    told = {digest}
+    for instance in (moved, named, make_instance(task, 3, split="train"), *perturbed):
+        env.load(instance)
+        told.add(env.scene_digest())
+    assert len(told) == 4 + len(perturbed), "every axis shows"
+    env.load(last_bits)
+    assert env.scene_digest() == digest, "the last bit does not"
+    for field in ("body_mass", "geom_friction"):
+        array = getattr(world.model, field)
+        was = array.copy()
+        array *= 1.1
+        assert env.scene_digest() != digest, field
+        array[:] = was
+    assert env.scene_digest() == digest
 
 
 def test_a_snapshot_goes_on_to_the_same_bits_also_in_another_environment(env):

@@ -207,6 +207,10 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
 
         return project(self.world.model, self.world.data, points, self._camera(camera), size)
 
+    def scene_digest(self) -> str:
+        """Digest of the loaded instance's scene, as it was set up."""
+        return self.world.scene_digest()
+
     def snapshot(self) -> EnvSnapshot:
         """The state now; `restore` goes on from it to the same bits."""
         return EnvSnapshot(self.world.snapshot(), self.steps, self._reached)
