@@ -1,6 +1,8 @@
 """Comparing policies: pairing, what is claimed of it, what is written, and what CI is told."""
 
+import importlib.util
 import json
+import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +18,8 @@ from osel_sim.analysis.comparison import _verdict
 from osel_sim.analysis.pairing import Contender, Pairs
 from osel_sim.core.errors import DataError, SettingError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import Row, write_rollouts
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def rows_of(policy: str, successes: Iterable[object], task: str = "lift", first: int = 0, repeat: int = 0, **values) -> list[Row]:
@@ -346,6 +350,21 @@ def test_claims_are_wrong_as_rarely_as_promised():
         at_margin = decisions(pairs, 0.075, 0.125)  # 5 points lower, as the margin says
         assert at_margin["better"] + at_margin["no worse"] <= 0.025 + slack
     assert decisions(1000, 0.05, 0.15)["worse"] > 0.95 and decisions(1000, 0.1, 0.1)["no worse"] > 0.85
+
+
+def test_the_benchmark_of_claims_finds_them_true():
+    spec = importlib.util.spec_from_file_location("benchmark_of_compare", ROOT / "benchmarks" / "compare.py")
+    benchmark = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = benchmark
+    spec.loader.exec_module(benchmark)
+    for name, kind in benchmark.KINDS.items():
+        for size in (10, 50, 200):
+            found = benchmark.simulate(kind, size, 1, 120)
+            assert found["wrong"] <= (0.025 if "margin" in name else 0.05) + 0.035, (name, size, found)
+            assert found["coverage"] >= 0.90, (name, size, found)
+        assert benchmark.sequential(kind, 100, 100)["wrong"] <= 0.05, name
+    assert benchmark.simulate(benchmark.KINDS["worse"], 200, 1, 50)["worse"] > 0.9
+    assert benchmark.simulate(benchmark.noisy(benchmark.KINDS["equal"]), 20, 3, 20)["wrong"] <= 0.2
 
 
 def test_the_instances_that_would_tell_mostly_do():
