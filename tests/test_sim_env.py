@@ -7,8 +7,10 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+import osel_sim
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
 from osel_sim.formats.task_file import load_task_file
@@ -47,6 +49,23 @@ def test_passes_the_checkers_of_gymnasium_and_sb3():
     made.close()
 
 
+def test_sb3_learns_from_its_observations():
+    made = osel_sim.make_env("lift", cameras=CAMERAS, image_size=40)
+    model = PPO("MultiInputPolicy", made, n_steps=4, batch_size=4, n_epochs=1, device="cpu").learn(4)
+    assert model.num_timesteps == 4 and set(made.observation_space) == {"state", "image_agentview", "image_wrist"}
+    made.close()
+
+
+def test_observations_are_those_of_observe_under_names_without_dots(env):
+    watched = TaskEnv(env.task, cameras=CAMERAS, image_size=48)
+    observation, _ = watched.reset(seed=1)
+    shown = watched.observe(CAMERAS, 48)
+    np.testing.assert_array_equal(observation["state"], shown["observation.state"])
+    for camera in CAMERAS:
+        np.testing.assert_array_equal(observation[f"image_{camera}"], shown[f"observation.images.{camera}"])
+    watched.close()
+
+
 @pytest.mark.parametrize(
     "action",
     [np.zeros(6), np.zeros((1, 7)), np.zeros(8), 0.0, None, "up", [0.0] * 6 + ["open"], [[0.0], [0.0, 1.0]], np.zeros(7, bool), np.zeros(7, complex)],
@@ -67,7 +86,7 @@ def test_an_action_of_no_numbers_is_refused_and_a_large_one_is_clipped(env):
     states = []
     for size in (1.0, 50.0):
         env.reset(seed=0)
-        states.append(env.step([size] * 6 + [-size])[0]["observation.state"])
+        states.append(env.step([size] * 6 + [-size])[0]["state"])
     np.testing.assert_array_equal(*states)
 
 

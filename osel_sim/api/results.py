@@ -107,6 +107,11 @@ class ReplayResult:
     off_policy: Mapping[str, Any] | None = None
 
     @property
+    def pending(self) -> list[str]:
+        """What is not replayed yet: names of selectors, and `frontier`."""
+        return list(self.result.get("pending", [])) if self.result else []
+
+    @property
     def verdict(self) -> str:
         """Is routing worth it? In words; empty where nothing was replayed."""
         return str(self.result["verdict"]["text"]) if self.result else ""
