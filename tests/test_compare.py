@@ -2,8 +2,10 @@
 
 import importlib.util
 import json
+import os
 import sys
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -321,6 +323,16 @@ def test_a_page_shows_the_comparison_and_a_damaged_one_is_refused(tmp_path, caps
         osel.report(out, encoder="x")
     with pytest.raises(UsageError, match="--open shows the page"):
         osel.compare(tmp_path / "log", open=True)
+
+
+def test_a_pipe_is_written_into_and_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    logs = two_logs(tmp_path, 10, 5, 5, 10)
+    with ThreadPoolExecutor(1) as pool:
+        told = pool.submit((tmp_path / "pipe").read_text)
+        osel.compare(*logs, markdown=tmp_path / "pipe")
+        assert "points of success" in told.result(30)
+    assert (tmp_path / "pipe").is_fifo()
 
 
 def test_a_plan_says_how_many_instances_it_takes(tmp_path, capsys):
