@@ -91,9 +91,9 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
 
 
 def _check_stopping(config: RecordConfig) -> None:
-    """Refuse settings that only go with `--until-decided`."""
+    """Refuse settings that only go with `--until-decided`; a run.json has all settings, as they are by default."""
     for name in ("margin", "baseline", "baseline_policy"):
-        if name in config.given and getattr(config, name) is not None and not config.until_decided:
+        if getattr(config, name) != getattr(RecordConfig, name) and not config.until_decided:
             raise SettingError(name, "is for a recording until it is decided; add --until-decided, or leave it out")
     if config.baseline_policy is not None and config.baseline is None:
         raise SettingError("baseline_policy", "is a policy of --baseline; give that log, too")
