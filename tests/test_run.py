@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -15,7 +16,7 @@ from run_helpers import HORIZON, children, command, environment, execute, make_w
 from synthetic_log import make_row, write_log
 
 from osel_sim.analysis.live import read_live
-from osel_sim.formats.journal import read_journal
+from osel_sim.formats.journal import read_journal, to_line
 from osel_sim.reporting.run_page import run_page
 from osel_sim.run import main as run_main
 from osel_sim.selection.state import load_state
@@ -64,6 +65,7 @@ def test_what_a_run_writes_and_prints(world, reference):
     assert remote, "the untrained selector explores"
     assert all(decision.seconds.upload > 0 and decision.price > 0 and decision.actions < HORIZON for decision in remote)
     assert len((folder / "timing.jsonl").read_text().splitlines()) == EPISODES
+    assert len({decision.scene for decision in decisions} - {None}) == EPISODES
 
 
 def test_summary_agrees_with_the_journal(reference):
@@ -117,6 +119,24 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
     assert user(world, *arguments, "--resume", "--no-page") == 0
     assert not (folder / "report.html").exists()
     assert bytes_of(folder) == bytes_of(reference[0])
+
+
+@pytest.mark.slow
+def test_a_journal_begun_without_scenes_goes_on_without(world, reference):
+    folder = world / "older"
+    shutil.copytree(reference[0], folder)
+
+    def without(lines: list[str]) -> bytes:
+        return "".join(to_line({key: value for key, value in json.loads(line).items() if key != "scene"}) for line in lines).encode()
+
+    lines = (folder / "episodes.jsonl").read_text().splitlines()
+    for name in ("timing.jsonl", "counterfactual.jsonl"):
+        (folder / name).write_text("".join((folder / name).read_text().splitlines(keepends=True)[:3]))
+    (folder / "episodes.jsonl").write_bytes(without(lines[:3]))
+    (folder / "summary.json").unlink()
+    done = execute(world, "run", "--episodes", EPISODES, "--counterfactual", "--out", folder, "--resume", "--no-page")
+    assert done.returncode == 0, done.stderr
+    assert (folder / "episodes.jsonl").read_bytes() == without(lines)
 
 
 def test_noise_on_actions_reaches_the_robot(tmp_path):
