@@ -93,19 +93,24 @@ class HiddenLayer:
             contexts: (n, sketched dim). chosen: (n,) columns. targets: (n,) rewards + costs, standardised. policies: number of outputs.
         """
         import torch
+        from torch.optim.adamw import adamw
 
         inputs = self._inputs(contexts)
-        seen, columns, centred = (torch.from_numpy(values) for values in (inputs, chosen[:, None], targets - targets.mean()))
-        first = torch.nn.Parameter(torch.from_numpy(self._weights.copy()))
-        second = torch.nn.Parameter(torch.zeros(self.dim, policies, dtype=torch.float64))
-        optimiser = torch.optim.AdamW([first, second], lr=RATE, weight_decay=DECAY, fused=True)
-        with threads(1):  # a matrix product's last bits depend on how many share it
+        seen, columns, centred = (torch.from_numpy(values) for values in (inputs, chosen[:, None], (targets - targets.mean())[:, None]))
+        weights = [torch.from_numpy(self._weights.copy()), torch.zeros(self.dim, policies, dtype=torch.float64)]
+        means, squares = ([torch.zeros_like(matrix) for matrix in weights] for _ in range(2))
+        counts = [torch.zeros(()) for _ in weights]
+        settings = {"lr": RATE, "weight_decay": DECAY, "beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "amsgrad": False, "maximize": False}
+        # The gradients of two layers are quickly written down: autograd would take several times as long to find them.
+        with threads(1), torch.no_grad():  # a matrix product's last bits depend on how many threads share it
             for _ in range(STEPS):
-                optimiser.zero_grad()
-                predicted = (torch.relu(seen @ first) @ second).gather(1, columns)[:, 0]
-                torch.autograd.backward((predicted - centred).square().sum() / (2 * len(centred)))
-                optimiser.step()
-        self._weights = first.detach().numpy()
+                hidden = torch.relu(seen @ weights[0])
+                outputs = hidden @ weights[1]
+                errors = (outputs.gather(1, columns) - centred) * (1.0 / len(centred))
+                deltas = torch.zeros_like(outputs).scatter_(1, columns, errors)
+                gradients = [seen.T @ ((deltas @ weights[1].T) * (hidden > 0)), hidden.T @ deltas]
+                adamw(weights, gradients, means, squares, [], counts, fused=True, **settings)
+        self._weights = weights[0].numpy()
         self._set_scale(inputs)
 
     def transform(self, contexts: Array) -> Array:
