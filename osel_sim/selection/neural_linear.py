@@ -100,7 +100,7 @@ class HiddenLayer:
         weights = [torch.from_numpy(self._weights.copy()), torch.zeros(self.dim, policies, dtype=torch.float64)]
         means, squares = ([torch.zeros_like(matrix) for matrix in weights] for _ in range(2))
         counts = [torch.zeros(()) for _ in weights]
-        settings = {"lr": RATE, "weight_decay": DECAY, "beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "amsgrad": False, "maximize": False}
+        settings: dict[str, Any] = {"lr": RATE, "weight_decay": DECAY, "beta1": 0.9, "beta2": 0.999, "eps": 1e-8, "amsgrad": False, "maximize": False}
         # The gradients of two layers are quickly written down: autograd would take several times as long to find them.
         with threads(1), torch.no_grad():  # a matrix product's last bits depend on how many threads share it
             for _ in range(STEPS):
