@@ -142,7 +142,7 @@ def _demonstrate(env: Environment, cameras: tuple[str, ...], image_size: int, rn
         raise UsageError(f"the environment of {env.specification.name} has no scripted expert")
     spec = env.specification
     action_spec, expert = spec.action, env.expert()
-    longest = tuple(round(steps * spec.control_hz / BURST_HZ) for steps in BURST_STEPS)
+    shortest, longest = (round(steps * spec.control_hz / BURST_HZ) for steps in BURST_STEPS)
     rows: list[dict[str, Any]] = []
     burst, left = np.zeros(action_spec.dimension), 0
     while not env.success:
@@ -152,7 +152,7 @@ def _demonstrate(env: Environment, cameras: tuple[str, ...], image_size: int, rn
         if left == 0 and rng.random() < BURST_PROBABILITY * BURST_HZ / spec.control_hz:
             burst = np.zeros(action_spec.dimension)
             burst[action_spec.motions] = BURST * action_spec.half_range[action_spec.motions] * rng.uniform(-1, 1, len(action_spec.motions))
-            left = int(rng.integers(*longest))
+            left = int(rng.integers(shortest, longest))
         rows.append({**env.observe(cameras, image_size), "action": action, "annotation.noise": np.array([float(left > 0)], np.float32)})
         env.advance(action_spec.clip(action + burst) if left > 0 else action)
         left = max(0, left - 1)
