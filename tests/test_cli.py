@@ -13,6 +13,7 @@ import pytest
 
 from osel_sim.__main__ import COMMANDS, main
 from osel_sim.api.settings import MAIN, Count, Folder, Index, Levels, NonNegative, Settings, settings
+from osel_sim.cli import suites_command
 from osel_sim.cli.command import BROKEN_PIPE, Command, reported
 from osel_sim.core.docstrings import field_docstrings
 from osel_sim.core.errors import SettingError, UnknownNameError, UsageError
@@ -125,7 +126,8 @@ def test_a_configuration_is_checked_where_it_is_made_and_survives_json() -> None
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_setting_of_every_command_is_explained(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     command = import_module(f"osel_sim.{name}")
-    for each in [command.main] if isinstance(command.main, Command) else [command.policy_command, command.encoder_command]:
+    several = suites_command.commands.values() if name == "suites" else [command.main]
+    for each in several if isinstance(command.main, Command) or name == "suites" else [command.policy_command, command.encoder_command]:
         described = field_docstrings(each.config)
         assert [field.name for field in fields(each.config) if not described.get(field.name)] == []
     assert main([name, "--help"]) == 0

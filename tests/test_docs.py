@@ -14,6 +14,7 @@ import pytest
 
 from osel_sim.__main__ import COMMANDS
 from osel_sim.api.run import RunConfig
+from osel_sim.cli import suites_command
 from osel_sim.cli.command import Command, read_settings
 from osel_sim.core import content
 from osel_sim.formats.dataset_mapping import load_dataset_mapping
@@ -130,7 +131,9 @@ def calls() -> dict[str, tuple[str, str]]:
 
 
 def commands_of(name: str) -> list[Command]:
-    """The command of that name; `train` is two."""
+    """The command of that name; `train` is two, and so is `suites`."""
+    if name == "suites":
+        return list(suites_command.commands.values())
     module = import_module(f"osel_sim.{name}")
     return [module.main] if isinstance(module.main, Command) else [module.policy_command, module.encoder_command]
 
@@ -166,7 +169,10 @@ def test_command_lines_have_flags_that_exist(
     words = words_of(rest)
     if not words:
         return
-    command = commands_of(name)[-1 if any(word.startswith("--encoder") for word in words) else 0]
+    if name == "suites":
+        command, words = suites_command.commands[words[0]], words[1:]
+    else:
+        command = commands_of(name)[-1 if any(word.startswith("--encoder") for word in words) else 0]
     if "--config" in words:
         Path("settings.toml").write_text("")
         words[words.index("--config") + 1] = "settings.toml"

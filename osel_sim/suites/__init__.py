@@ -1,5 +1,7 @@
-"""Suites by name, and what those of others are made of."""
+"""Suites by name, and what those of others are made of; as a command, `python -m osel_sim.suites`."""
 
+from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 from osel_sim.core.registry import Registry
@@ -15,3 +17,10 @@ SUITES = Registry[Any](
     },
 )
 """What makes each suite, ours and those of others; `osel_sim.suites.registry` calls it."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit code."""
+    # By name: what commands share lies above this package, and must not be imported by it.
+    code: int = import_module("osel_sim.cli.suites_command").main(arguments)
+    return code
