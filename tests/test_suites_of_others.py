@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+import osel_sim
 from osel_sim.cli.suites_command import main
 from osel_sim.core.errors import ContentError, MissingPackageError, UnknownNameError, UsageError
 from osel_sim.suites.check import check_task
@@ -53,6 +54,26 @@ def _registered():
 
 
 # -- gymnasium ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_page_of_a_run_says_that_there_are_no_snapshots(tmp_path):
+    class East:
+        def reset(self, instruction):
+            pass
+
+        def act(self, observation):
+            return np.array([[1.0, 0.0]], np.float32)
+
+    class West(East):
+        def act(self, observation):
+            return np.array([[-1.0, 0.0]], np.float32)
+
+    result = osel_sim.run(
+        task="gym:osel_test/Right-v0", policies=[East(), West()], selector="random", episodes=2, counterfactual=True, out=tmp_path / "run"
+    )
+    assert result.page is not None and "started again from the same seed" in result.page.read_text()
+    assert all(decision.outcome.success == (decision.policy == "east") for decision in result.journal)
 
 
 def test_any_gymnasium_environment_that_says_success_is_a_task():
