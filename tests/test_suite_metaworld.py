@@ -257,7 +257,7 @@ def test_a_log_its_replay_and_their_pages(experts, tmp_path):
     assert len(rows) == 16 and all(row.error is None for row in rows)
     success = {name: np.mean([row.success for row in rows if row.policy == name]) for name in ("quick", "pensive")}
     assert success["quick"] > success["pensive"], "half a second before every action is 40 steps of 500"
-    osel_sim.replay(log, selectors=["linucb", "random"], seeds=2, frontier=False, workers=1, out=tmp_path / "replay")
+    osel_sim.replay(log, selectors=["linucb", "random"], seeds=2, no_frontier=True, workers=1, out=tmp_path / "replay")
     for folder in (log, tmp_path / "replay"):
         assert osel_sim.report(folder, scenes=1).page.is_file()
 

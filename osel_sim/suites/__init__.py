@@ -13,6 +13,7 @@ SUITES = Registry[Any](
         "osel_sim": "osel_sim.sim.suite:OurSuite",
         "metaworld": "osel_sim.suites.metaworld.suite:Metaworld",
         "gym": "osel_sim.suites.gym.suite:Gym",
+        "robosuite": "osel_sim.suites.robosuite.suite:Robosuite",
         "lerobot": "osel_sim.suites.lerobot.suite:LeRobot",
     },
 )
