@@ -193,6 +193,44 @@ def test_what_lerobot_does_not_have_is_said():
         find_task("lerobot:vlabench")
 
 
+# -- robosuite ---------------------------------------------------------------------------------------------------------
+
+ARMS = ["Lift", "Lift/UR5e", "Lift/IIWA", "Lift/Jaco", "Lift/Kinova3"]
+OTHERS = ["Stack", "NutAssembly", "NutAssemblySquare", "NutAssemblyRound", "PickPlace", "PickPlaceMilk", "PickPlaceBread", "PickPlaceCereal"]
+
+
+def test_robosuites_tasks_are_its_environments_with_its_arms():
+    tasks = select_tasks(["robosuite:all"])
+    assert {f"robosuite:{name}" for name in [*ARMS, *OTHERS, "PickPlaceCan", "Door", "ToolHang"]} <= {task.name for task in tasks}
+    assert {task.robot for task in select_tasks(["robosuite:tag:ur5e"])} == {"UR5e"}
+    one, other = find_task("robosuite:Lift").instance(3), find_task("robosuite:Lift/Jaco").instance(3)
+    assert one.instruction == other.instruction and one.key != other.key
+    with pytest.raises(UnknownNameError, match="did you mean 'robosuite:Lift"):
+        find_task("robosuite:Lift/Sawyer")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ARMS)
+def test_robosuite_moves_as_it_does_with_its_own_control(name):
+    task = find_task(f"robosuite:{name}")
+    env = task.open()
+    actions = np.random.default_rng(0).uniform(-1, 1, (6, 7)).astype(np.float32)
+    hands = []
+    for step in (env.advance, env._env.step):
+        env.load(task.instance(1))
+        for action in actions:
+            step(action)
+        hands.append(env._data.site(env._robot.grip_site).xpos.copy())
+    env.close()
+    assert np.abs(hands[0] - hands[1]).max() < 1e-4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Lift/UR5e", "PickPlaceCan", "Door", "NutAssemblySquare", "ToolHang"])
+def test_robosuite_keeps_what_a_suite_promises(name):
+    check_task(find_task(f"robosuite:{name}"))
+
+
 # -- Python environments -----------------------------------------------------------------------------------------------
 
 
@@ -219,7 +257,7 @@ def test_names_of_environments_get_the_nearest():
 def test_suites_are_listed_with_what_they_are_and_cannot(capsys):
     assert main(["list", "--json"]) == 0
     found = {suite["name"]: suite for suite in json.loads(capsys.readouterr().out)}
-    assert {"gym", "lerobot", "metaworld"} <= set(found)
+    assert {"gym", "lerobot", "metaworld", "robosuite"} <= set(found)
     assert found["gym"]["cannot"][0].startswith("no snapshots") and found["metaworld"]["cannot"] == []
     assert len(found["metaworld"]["tasks"]) == 50
     assert main(["list", "--suite", "gim"]) == 2 and "did you mean 'gym'" in capsys.readouterr().err

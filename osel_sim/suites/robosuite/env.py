@@ -32,6 +32,9 @@ class RobosuiteEnvironment(BaseEnvironment):
 
     def __init__(self, task: str) -> None:
         robosuite = quiet_robosuite()
+
+        import mujoco
+
         spec = specification(task)
         super().__init__(spec, int(spec.horizon or 0))
         name, arm = parts(task)
@@ -44,7 +47,12 @@ class RobosuiteEnvironment(BaseEnvironment):
         self._control = self._new_control()
         xml = self._env.sim.model.get_xml()
         self._view = MujocoView(
-            self._model, self._data, lambda: _described(xml), groups=SHOWN, sites=False, make_light=lambda spec: _light(spec, xml)
+            self._model,
+            self._data,
+            lambda: mujoco.MjSpec.from_string(xml),
+            groups=SHOWN,
+            sites=False,
+            make_light=lambda spec: lighten(spec, xml, LightMeshes()),
         )
 
     def start(self, instance: PlainInstance) -> None:
@@ -138,13 +146,3 @@ def _description(env: Any, arm: str) -> Robot:
     joints = len(robot.robot_model.joints)
     hand = Gripper("", tuple(map(float, gripper.init_qpos)), tuple(map(float, closing)), (), (), speed=float(gripper.speed))
     return Robot(arm, "", hand, tuple(map(float, robot.init_qpos)), (0.0,) * joints, (0.0,) * joints)
-
-
-def _described(xml: str) -> Any:
-    import mujoco
-
-    return mujoco.MjSpec.from_string(xml)
-
-
-def _light(spec: Any, xml: str) -> None:
-    lighten(spec, xml, LightMeshes())
