@@ -44,7 +44,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     for key in ("configuration", "environment"):
         if not isinstance(data.setdefault(key, {}), dict):
             raise DataError(f"{file}: {key} must be an object, got {quoted(data[key])}")
-    for key, name in (("configuration", "content"), ("environment", "versions")):
+    for key, name in (("configuration", "content"), ("environment", "versions"), ("environment", "suites")):
         if not TEXTS.fits(data[key].get(name) or {}):
             raise DataError(f"{file}: {key}.{name} must be {TEXTS.wanted}, got {quoted(data[key][name])}")
     return data
