@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from osel_sim.api.results import ReplayResult
 from osel_sim.api.reward import weights_of
-from osel_sim.api.settings import MAIN, OTHER, Count, Folder, LoggedRewardSettings, Names, settings
+from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, settings
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.engine import Setup
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.analysis.targets import Target
     from osel_sim.interface.selector import SelectorFactory
     from osel_sim.selection.reward import RewardWeights
 
@@ -54,6 +55,9 @@ class ReplayConfig(LoggedRewardSettings):
     """do not replay selectors at other weights of time and price as well"""
     encoder: Annotated[str | None, OTHER] = None
     """whose contexts, where the log has several (default: the one it was recorded with)"""
+    targets: Annotated[Files, OTHER] = ()
+    """of a live run or logged decisions: tables of how you would choose (columns policy, probability, and decision or instance); what each would have
+    earned is estimated too"""
     context: Annotated[Literal["task"] | None, OTHER] = None
     """append the task's name to the contexts; auto finds out whether it helps"""
 
@@ -67,6 +71,7 @@ def replay(
     log: "Path | str | ReplayConfig",
     *,
     selectors: "str | Sequence[str | SelectorFactory] | None" = None,
+    targets: "Mapping[str, Target] | Sequence[Path | str] | Path | str | None" = None,
     on_result: Callable[[ReplayResult], None] | None = None,
     **values: Any,
 ) -> ReplayResult:
@@ -75,6 +80,8 @@ def replay(
     Args:
         log: folder of a rollout log or of a live run; or all settings as one object, of which `values` change some.
         selectors: names, or classes or functions of one's own: called with the policies' names, the context's length and the seed.
+        targets: of a live run, or of logged decisions: tables, or functions by name, of ways of choosing of one's own, whose reward is estimated
+            too. A function is called with an instance and its context and returns policy -> probability.
         on_result: called as soon as the verdict is there, before selectors are replayed at other weights for the frontier.
         values: settings by name, as `ReplayConfig` has them.
 
@@ -89,8 +96,11 @@ def replay(
     if selectors is not None:
         factories = {factory_name(selector): selector for selector in selectors if not isinstance(selector, str)}
         values["selectors"] = [selector if isinstance(selector, str) else factory_name(selector) for selector in selectors]
+    functions = targets if isinstance(targets, Mapping) else {}
+    if targets is not None and not isinstance(targets, Mapping):
+        values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
-    return _Replay(config, factories, on_result).execute()
+    return _Replay(config, factories, functions, on_result).execute()
 
 
 @dataclass(frozen=True)
@@ -99,6 +109,7 @@ class _Replay:
 
     config: ReplayConfig
     factories: "Mapping[str, SelectorFactory]"
+    targets: "Mapping[str, Target]"
     on_result: Callable[[ReplayResult], None] | None
 
     def execute(self) -> ReplayResult:
@@ -116,6 +127,8 @@ class _Replay:
             log = read_log(config.log, config.encoder)
             weights, preset = weights_of(config, log.metadata)
             if not has_choices(log):
+                if config.targets or self.targets:
+                    raise UsageError(f"{log.source} has the outcomes of every policy: a target is estimated from a live run or from logged decisions")
                 return self._replay(selectors, log, weights, preset)
             live = choices_of(log)
         else:
@@ -237,10 +250,16 @@ class _Replay:
     def _off_policy(self, live: "LiveLog", weights: "RewardWeights") -> dict[str, Any]:
         """Estimates from a live run's propensities."""
         from osel_sim.analysis.evaluation import evaluate
+        from osel_sim.analysis.targets import check_names, probabilities_of
+        from osel_sim.ingestion.target_tables import read_target
 
         if self.config.policies or self.config.half:
             raise UsageError("--policies and --half are for rollout logs: decisions that were made are evaluated as they were made")
-        return evaluate(live, weights)
+        log = live.outcomes
+        check_names([*(file.stem for file in self.config.targets), *self.targets], log.policies)
+        own = {file.stem: read_target(file, log.keys, log.policies) for file in self.config.targets}
+        own |= {name: probabilities_of(name, target, live) for name, target in self.targets.items()}
+        return evaluate(live, weights, own)
 
 
 def _told(setup: "Setup") -> dict[str, Any]:
