@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,6 +12,7 @@ from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewar
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
+    from osel_sim.analysis.encoder_choice import EncoderChoice
     from osel_sim.analysis.engine import Setup
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
@@ -54,7 +55,8 @@ class ReplayConfig(LoggedRewardSettings):
     no_frontier: Annotated[bool, OTHER] = False
     """do not replay selectors at other weights of time and price as well"""
     encoder: Annotated[str | None, OTHER] = None
-    """whose contexts, where the log has several (default: the one it was recorded with)"""
+    """whose contexts, where the log has several, or auto: those that predict rewards best, by the choosing half (default: the one it was recorded
+    with)"""
     targets: Annotated[Files, OTHER] = ()
     """of a live run or logged decisions: tables of how you would choose (columns policy, probability, and decision or instance); what each would have
     earned is estimated too"""
@@ -114,6 +116,7 @@ class _Replay:
 
     def execute(self) -> ReplayResult:
         """Do it."""
+        from osel_sim.analysis.encoder_choice import AUTO, with_best_encoder
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
         from osel_sim.analysis.logged_choices import choices_of, has_choices
@@ -124,19 +127,22 @@ class _Replay:
         selectors = [*choose_selectors(named, halved=config.half is not None), *self.factories]
         check_replay_folder(folder, config.overwrite)
         if not is_live_run(config.log):
-            log = read_log(config.log, config.encoder)
+            log = read_log(config.log, None if config.encoder == AUTO else config.encoder)
             weights, preset = weights_of(config, log.metadata)
             if not has_choices(log):
                 if config.targets or self.targets:
                     raise UsageError(f"{log.source} has the outcomes of every policy: a target is estimated from a live run or from logged decisions")
-                return self._replay(selectors, log, weights, preset)
+                log, choice = with_best_encoder(log, weights) if config.encoder == AUTO else (log, None)
+                return self._replay(selectors, log, weights, preset, choice)
             live = choices_of(log)
+        elif config.encoder == AUTO:
+            raise UsageError(f"--encoder {AUTO} is for rollout logs: {config.log} is a live run, whose selector saw one encoder's contexts")
         else:
             live = read_live(config.log, config.encoder)
             weights, preset = weights_of(config, recorded=live.reward)
         found = self._off_policy(live, weights)
         if live.has_all_outcomes(weights):
-            return self._replay(selectors, live.outcomes, weights, preset, found)
+            return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
         write_off_policy(folder, found)
         return self._tell(ReplayResult(folder, off_policy=found))
 
@@ -146,6 +152,7 @@ class _Replay:
         log: "LoggedOutcomes",
         weights: "RewardWeights",
         preset: str | None,
+        choice: "EncoderChoice | None" = None,
         off_policy: dict[str, Any] | None = None,
     ) -> ReplayResult:
         """Replay, write and tell; then at other weights."""
@@ -170,6 +177,7 @@ class _Replay:
         choices = with_fixed(chosen, best)
         result = build(log, weights, preset, choices, best, left_out, range(config.seeds))
         result["log"] |= {"half": config.half, "context": config.context}
+        result["log"]["encoder_choice"] = None if choice is None else {"text": str(choice), **asdict(choice)}
         result["off_policy"] = off_policy
         result |= _told(here)
         write_replay(config.folder, result, choices, tables(result))
