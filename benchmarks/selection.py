@@ -8,7 +8,7 @@ decisions and in successes: below 0 where a selector gains by the context. A see
 the best by more than 0.05, or, where the context matters, if that quarter came to 0.05 less a decision than the best single policy.
 
 A log's instances come in a random order, those of `--half` only, with `--preset`'s rewards, and at most 3,000 of them. Settings of `auto` were chosen
-on seeds below 1000 of like problems and on the choosing half of `assets/logs/suite`; the default seeds had no part in that.
+on like problems drawn from other seeds and on the choosing half of `assets/logs/suite`; the default seeds had no part in that.
 
 With `--results FILE` every seed is written there as soon as it was played, and what is there is not played again: a benchmark that was cut off,
 or one of more seeds, goes on. Seeds come in turn, so an early end leaves some of every problem. Begin a new file after a change of the code.
@@ -109,10 +109,10 @@ def _log(folder: str, half: str | None, preset_name: str) -> tuple[NDArray[np.fl
     """Contexts (N, D), rewards (N, P, R), expected costs (P,) and skills of a log's complete instances."""
     import osel_sim as osel
     from osel_sim.analysis.streams import complete_instances
-    from osel_sim.selection.reward import preset
+    from osel_sim.selection.reward import RewardWeights, preset
     from osel_sim.selection.skills import Skills
 
-    weights = preset(preset_name)
+    weights = RewardWeights(0.0, 0.0) if preset_name == "success" else preset(preset_name)
     log = osel.load_log(folder)
     mine = log.half(half) if half else np.ones(len(log), bool)
     costs = (log.take(~mine) if half else log).expected_costs(weights)
@@ -153,7 +153,7 @@ def main() -> None:
     parser.add_argument("--problems", nargs="*", choices=list(PROBLEMS), metavar="NAME", help="default: all")
     parser.add_argument("--logs", nargs="*", default=[], help="folders of rollout logs; alone, no made-up problem is played")
     parser.add_argument("--half", choices=("choose", "score"))
-    parser.add_argument("--preset", default="oxe")
+    parser.add_argument("--preset", default="oxe", help="of rewards; success for success alone")
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--first-seed", type=int, default=2000)
     parser.add_argument("--workers", type=int, default=2)
