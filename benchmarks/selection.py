@@ -13,9 +13,9 @@ on like problems drawn from other seeds and on the choosing half of `assets/logs
 With `--results FILE` every seed is written there as soon as it was played, and what is there is not played again: a benchmark that was cut off,
 or one of more seeds, goes on. Seeds come in turn, so an early end leaves some of every problem. Begin a new file after a change of the code.
 
-The last line is JSON: by selector the mean regret per 1000 decisions, the shares of stuck seeds and of problems on which no other of the selectors is
-ahead beyond the error, and the milliseconds of one decision with its update; by problem what the best single policy has, and of each selector the
-regret, its standard error and the share of stuck seeds.
+It prints a table in Markdown: regret ± standard error. The last line is JSON: by selector the mean regret per 1000 decisions, the shares of stuck
+seeds and of problems on which no other of the selectors is ahead beyond the error, and the milliseconds of one decision with its update; by problem
+what the best single policy has, and of each selector the regret, its standard error and the share of stuck seeds.
 """
 
 import argparse
@@ -35,6 +35,12 @@ from selection_problems import PROBLEMS, Problem, names
 from osel_sim.core.progress import progress
 from osel_sim.selection.registry import make_selector, wanted_of
 
+OVERALL = {
+    "regret_per_1000": "regret per 1000 decisions",
+    "stuck": "share of stuck seeds",
+    "unbeaten": "share of problems on which none is ahead",
+    "milliseconds": "milliseconds a decision",
+}
 CLOSE = 0.05 + 1e-9
 """A policy that is worse by no more than this is not worth finding."""
 
@@ -164,7 +170,7 @@ def main() -> None:
     problems = [*made, *(str(Path(log)) for log in options.logs)]
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     played = play_all([Job(problem, seed, tuple(options.selectors)) for seed in seeds for problem in problems], options)
-    print(f"{'':34s}" + "".join(f"{name:>22s}" for name in options.selectors))
+    print(f"\n| problem | decisions | best single | {' | '.join(options.selectors)} |\n|---|---|---|{'---|' * len(options.selectors)}")
     found: dict[str, dict[str, Any]] = {}
     unbeaten = dict.fromkeys(options.selectors, 0)
     for problem in problems:
@@ -178,8 +184,8 @@ def main() -> None:
             found[problem][name] = {key: round(float(value), 4) for key, value in figures.items()}
             ahead = [regrets[name] - regrets[other] for other in options.selectors if other != name]
             unbeaten[name] += all(gap.mean() <= 1.96 * _error(gap) for gap in ahead)
-        cells = (f"{one['regret']:9.1f} ±{one['error']:5.1f} {100 * one['stuck']:3.0f}%" for one in map(found[problem].get, options.selectors))
-        print(f"{problem[-34:]:34s}" + "".join(f"{cell:>22s}" for cell in cells), flush=True)
+        cells = (_cell(found[problem][name]) for name in options.selectors)
+        print(f"| {Path(problem).name} | {some[0].decisions} | {found[problem]['best_single']:.0f} | {' | '.join(cells)} |")
     overall = {
         name: {
             "regret_per_1000": round(float(np.mean([1e3 * own[name]["regret"] / own["decisions"] for own in found.values()])), 2),
@@ -189,7 +195,14 @@ def main() -> None:
         }
         for name in options.selectors
     }
+    for key, heading in OVERALL.items():
+        print(f"| {heading} | | | {' | '.join(f'{own[key]:g}' for own in overall.values())} |")
     print(json.dumps({"selectors": overall, "problems": found}))
+
+
+def _cell(own: dict[str, float]) -> str:
+    """Regret, its standard error, and the share of stuck seeds where there are any."""
+    return f"{own['regret']:.1f} ± {own['error']:.1f}" + (f" ({own['stuck']:.0%} stuck)" if own["stuck"] else "")
 
 
 def _error(values: NDArray[np.float64]) -> float:
