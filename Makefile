@@ -1,4 +1,4 @@
-# make run | test | slow | lint | docs | bench | policies | wheel | schemas | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
+# make run | test | slow | stock | lint | docs | bench | policies | wheel | schemas | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
@@ -17,7 +17,7 @@ EPISODES ?= 240
 INSTANCES ?= 50
 POLICIES := local_small remote_specialist remote_base remote_large
 
-.PHONY: run test slow lint docs bench policies wheel schemas requirements environment clean
+.PHONY: run test slow stock lint docs bench policies wheel schemas requirements environment clean
 
 run: $(READY)
 	$(PYTHON) -m osel_sim.run --task pick_place --policies local_small remote_large --counterfactual --video 3 --out $(OUT) $(ARGS)
@@ -27,6 +27,14 @@ test: $(READY)
 
 slow: $(READY)
 	$(ONE_THREAD) $(PYTHON) -m pytest -m slow $(SHARED) $(ARGS)
+
+# What LeRobot's Diffusion and SmolVLA need besides lies in a folder of its own: where transformers is installed, every import of LeRobot takes twice as long.
+STOCK := .venv/stock
+
+stock: $(READY)
+	[ requirements-stock.txt -ot $(STOCK)/.ready ] || { \
+		.venv/bin/uv pip install --quiet --compile-bytecode --python $(PYTHON) --no-deps --target $(STOCK) -r requirements-stock.txt && touch $(STOCK)/.ready; }
+	PYTHONPATH=$(STOCK) $(ONE_THREAD) $(PYTHON) -m pytest tests/test_stock_policies.py $(ARGS)
 
 lint: $(READY)
 	.venv/bin/ruff check .
@@ -70,7 +78,7 @@ requirements: $(READY)
 environment: $(READY)
 
 # requirements.txt holds the whole closure, hence --no-deps: nothing is resolved a second time.
-$(READY): requirements.txt pyproject.toml
+$(READY): requirements.txt pyproject.toml plugins/lerobot_env_osel_sim/pyproject.toml
 	@python=; for candidate in python3.12 python3.13 python3; do \
 		if $$candidate -c 'import sys, venv; sys.exit(not (3, 12) <= sys.version_info[:2] < (3, 14))' 2>/dev/null; then python=$$candidate; break; fi; \
 	done; \
@@ -79,7 +87,7 @@ $(READY): requirements.txt pyproject.toml
 	[ -x $(PYTHON) ] || $$python -m venv .venv
 	$(PYTHON) -m pip install --quiet --disable-pip-version-check "$$(grep '^uv==' requirements.txt)"
 	.venv/bin/uv pip install --quiet --compile-bytecode --python $(PYTHON) --no-deps -r requirements.txt
-	.venv/bin/uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e .
+	.venv/bin/uv pip install --quiet --python $(PYTHON) --no-deps --no-build-isolation -e . -e plugins/lerobot_env_osel_sim
 	$(PYTHON) -m osel_sim.cli.prepare
 	@touch $@
 

@@ -1,12 +1,17 @@
-"""How much quicker than SB3's own loop: PPO with the paper's settings over a logged stream.
+"""How quick replays are: PPO against SB3's own loop, what bounds it, `auto`, and all of a replay by its stages.
 
-    python benchmarks/replay.py [--dim 256] [--decisions 1000] [--seeds 20] [--sb3-seeds 2] [--workers 2]
+    python benchmarks/replay.py [--parts ppo bound auto whole] [--decisions 1000] [--sb3-seeds 2] [--seeds 20] [--workers 2] [--log assets/logs/suite]
 
-Both sides make the same decisions on the same contexts and rewards in one run. First one seed after another in this process, one thread each, SB3's
-`learn()` and ours in turn for the first few seeds, less the time of five decisions, which is that of making the networks; then ours for all seeds in
-`--workers` processes, starting them included, as `python -m osel_sim.replay` does it (on an idle machine; 1 leaves this out). What 20 seeds of 4,000
-decisions would take is extrapolated from the time a decision.
-The last line is JSON: ratio (one SB3 loop to our processes), ratio_one_thread, decisions a second of each.
+- `ppo`: both sides make the same decisions on the same contexts and rewards, one seed after another, one thread each, SB3's `learn()` and ours in
+  turn, less the time of five decisions, which is that of making the networks; then ours for all seeds in `--workers` processes, starting them
+  included, as `python -m osel_sim.replay` does it. What 20 seeds of 4,000 decisions would take is extrapolated from the time a decision.
+- `bound`: one epoch of PPO's training on a rollout beside just reading and writing as much memory as its weights and moments are.
+- `auto`: one seed of the score half of `--log`, one thread.
+- `whole`: `python -m osel_sim.replay --log ... --half score` with every selector, until the first verdict, until all selectors, until the frontier.
+
+Seconds are for an idle machine. On a busy one look at the CPU seconds, which are those of all processes together: two idle cores take half as long.
+The last line is JSON: ratio (one SB3 loop to our processes), ratio_one_thread, decisions a second of each, epoch_ms, memory_ms,
+auto_decisions_per_second, and of each stage its seconds and cpu_seconds, from the beginning on.
 """
 
 import argparse
@@ -16,26 +21,35 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
-from stable_baselines3 import PPO
 
 from osel_sim.analysis.engine import _one_thread, replay_one
-from osel_sim.selection.environment import SelectionEnv, table_rounds
-from osel_sim.selection.ppo.sb3 import PPOSelector
 
 POLICIES = ("local", "remote")
+PARTS = ("ppo", "bound", "auto", "whole")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to measure (default: all)")
     parser.add_argument("--dim", type=int, default=256, help="length of a context (default: %(default)s, osel_small's)")
-    parser.add_argument("--decisions", type=int, default=1000, help="of a stream (default: %(default)s)")
-    parser.add_argument("--seeds", type=int, default=20, help="streams of our processes (default: %(default)s)")
+    parser.add_argument("--decisions", type=int, default=1000, help="of a stream of PPO's (default: %(default)s)")
+    parser.add_argument("--seeds", type=int, default=20, help="streams (default: %(default)s)")
     parser.add_argument("--sb3-seeds", type=int, default=2, help="the first so many of them one after another, with SB3 (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=2, help="processes of our side (default: %(default)s)")
+    parser.add_argument("--log", type=Path, default=Path("assets/logs/suite"), help="rollout log (default: %(default)s)")
     options = parser.parse_args()
+    measures = {"ppo": measure_ppo, "bound": measure_bound, "auto": measure_auto, "whole": measure_whole}
+    figures: dict[str, Any] = {"dim": options.dim, "workers": options.workers, "seeds": options.seeds}
+    for part in options.parts:
+        figures |= measures[part](options)
+    print(json.dumps(figures))
 
+
+def measure_ppo(options: argparse.Namespace) -> dict[str, float]:
+    """PPO against SB3's loop."""
     contexts, rewards = stream(options.decisions, options.dim)
     replay_one("ppo", contexts[:10], rewards[:10], POLICIES, 0)  # compile
     sb3(contexts[:10], rewards[:10], 0)
@@ -47,23 +61,94 @@ def main() -> None:
             ours -= timed(partial(replay_one, "ppo", contexts[:5], rewards[:5], POLICIES, seed))
     few, all_seeds = options.sb3_seeds * options.decisions, options.seeds * options.decisions
     together = in_processes(options) / all_seeds if options.workers > 1 else ours / few
-    print(f"contexts of {options.dim} numbers, {options.decisions} decisions, {options.seeds} seeds, {options.sb3_seeds} of them one after another")
+    print(
+        f"PPO: contexts of {options.dim} numbers, {options.decisions} decisions, {options.seeds} seeds, {options.sb3_seeds} of them one after another"
+    )
     for name, each in (
         ("SB3's learn(), one thread", theirs / few),
         ("ours, one thread", ours / few),
         (f"ours, {options.workers} processes", together),
     ):
         print(f"{name:26} {1 / each:7.1f} decisions/s; 20 seeds of 4,000 decisions: {20 * 4000 * each / 60:.1f} min")
-    figures = {
+    return {
         "ratio": theirs / few / together,
         "ratio_one_thread": theirs / ours,
         "sb3_decisions_per_second": few / theirs,
         "one_thread_decisions_per_second": few / ours,
         "decisions_per_second": 1 / together,
-        "dim": options.dim,
-        "workers": options.workers,
     }
-    print(json.dumps(figures))
+
+
+def measure_bound(options: argparse.Namespace) -> dict[str, float]:
+    """One epoch on a rollout, and one pass over memory of the size of what it changes: the least of some hundred, in turn."""
+    from osel_sim.core.compiled import njit
+    from osel_sim.selection.ppo.compiled import FastPPO
+    from osel_sim.selection.registry import make_selector
+
+    @njit(fastmath=True)
+    def touch(weights, first, second):  # type: ignore[no-untyped-def]
+        for j in range(len(weights)):
+            weights[j] = np.float32(1.0001) * weights[j]
+            first[j] = np.float32(0.9999) * first[j]
+            second[j] = np.float32(0.9999) * second[j]
+
+    contexts, rewards = stream(5, options.dim)
+    selector = make_selector("ppo", POLICIES, options.dim, 0, target_kl=None)
+    network = FastPPO(selector)
+    towers = [network.actor[:3], network.critic[:3]]
+    epochs, memory = [], []
+    for _ in range(40):
+        epochs.append(timed(partial(FastPPO(selector).run, contexts, rewards), time.process_time) / 10)
+        memory.append(timed(lambda: [touch(*tower) for tower in towers], time.process_time))
+    size = sum(array.nbytes for tower in towers for array in tower)
+    epoch, pass_over = min(epochs[1:]), min(memory[1:])
+    print(f"one epoch of PPO on a rollout: {1e3 * epoch:.2f} ms; reading and writing its {size / 1e6:.0f} MB once: {1e3 * pass_over:.2f} ms")
+    return {"epoch_ms": 1e3 * epoch, "memory_ms": 1e3 * pass_over}
+
+
+def measure_auto(options: argparse.Namespace) -> dict[str, float]:
+    """`auto` on the policies of a log."""
+    from osel_sim.analysis.log import read_log
+    from osel_sim.analysis.streams import complete_instances, draw_streams
+    from osel_sim.selection.reward import RewardWeights
+
+    weights = RewardWeights(0.2, 0.01)
+    log = read_log(options.log)
+    log, _ = complete_instances(log.take(log.half("score")), weights)
+    streams = draw_streams(log.rewards(weights), [0])
+    contexts, rewards = log.contexts[streams.order[0]], streams.rewards(log.rewards(weights), 0)
+    told = {"expected_costs": log.expected_costs(weights)} | ({} if log.skills is None else {"skills": log.skills})
+    with _one_thread():
+        replay_one("auto", contexts[:50], rewards[:50], log.policies, 0, **told)
+        seconds = timed(lambda: replay_one("auto", contexts, rewards, log.policies, 0, **told), time.process_time)
+    print(f"auto: {len(log) / seconds:.0f} decisions/s, {len(log)} of them between {len(log.policies)} policies")
+    return {"auto_decisions_per_second": len(log) / seconds}
+
+
+def measure_whole(options: argparse.Namespace) -> dict[str, float]:
+    """All of a replay, by its stages."""
+    import psutil
+
+    from osel_sim.api.replay import replay
+    from osel_sim.api.results import ReplayResult
+
+    process, figures, begun = psutil.Process(), dict[str, float](), time.perf_counter()
+
+    def cpu() -> float:
+        running = [child.cpu_times() for child in process.children(recursive=True)]
+        own = process.cpu_times()
+        return float(sum(times.user + times.system for times in running) + own.user + own.system + own.children_user + own.children_system)
+
+    before = cpu()
+
+    def tell(result: ReplayResult) -> None:
+        stage = "verdict" if len(result.pending) > 1 else "selectors" if result.pending else "everything"
+        figures[f"{stage}_seconds"], figures[f"{stage}_cpu_seconds"] = time.perf_counter() - begun, cpu() - before
+        print(f"{stage} after {figures[f'{stage}_seconds']:.0f} s, {figures[f'{stage}_cpu_seconds']:.0f} CPU s", flush=True)
+
+    with TemporaryDirectory() as folder:
+        replay(options.log, half="score", seeds=options.seeds, workers=options.workers, out=Path(folder) / "replay", on_result=tell)
+    return figures
 
 
 def stream(decisions: int, dim: int):
@@ -75,17 +160,22 @@ def stream(decisions: int, dim: int):
     return contexts, (generator.random((decisions, 2)) < generator.random((30, 2))[cluster]).astype(float)
 
 
-def sb3(contexts, rewards, seed: int) -> PPO:
+def sb3(contexts, rewards, seed: int):
     """The paper's settings in SB3's own loop."""
+    from stable_baselines3 import PPO
+
+    from osel_sim.selection.environment import SelectionEnv, table_rounds
+    from osel_sim.selection.ppo.sb3 import PPOSelector
+
     env = SelectionEnv(table_rounds(contexts, rewards, in_order=True), POLICIES, contexts.shape[1])
-    settings = {key: value for key, value in PPOSelector(POLICIES, 2, 0, layers=(2,)).settings.items() if key != "layers"}
+    settings = {key: value for key, value in PPOSelector(POLICIES, 2, 0, layers=(2,)).settings.items() if key not in ("layers", "activation")}
     algorithm = PPO("MlpPolicy", env, policy_kwargs={"net_arch": [768, 512, 128, 64, 16]}, seed=seed, device="cpu", **settings)
     return algorithm.learn(len(contexts))
 
 
 def in_processes(options: argparse.Namespace) -> float:
     """Seconds that the replays of a log take."""
-    from osel_sim.analysis.engine import Setup, replay
+    from osel_sim.analysis.engine import Part, Setup, replay
     from osel_sim.analysis.log import read_log
     from osel_sim.context.cache import ContextCache
     from osel_sim.formats.rollout_log import Row, write_rollouts
@@ -117,13 +207,14 @@ def in_processes(options: argparse.Namespace) -> float:
         write_rollouts(folder, rows, {"encoder": "made_up@1"})
         log = read_log(folder)
 
-    return timed(lambda: replay(log, [Setup(RewardWeights(0.0, 0.0))], ["ppo"], range(options.seeds), options.decisions, options.workers))
+    part = Part(log, [Setup(RewardWeights(0.0, 0.0))], ["ppo"], range(options.seeds), options.decisions)
+    return timed(lambda: list(replay([part], options.workers)))
 
 
-def timed(function: Callable[[], object]) -> float:
-    start = time.perf_counter()
+def timed(function: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
+    start = clock()
     function()
-    return time.perf_counter() - start
+    return clock() - start
 
 
 if __name__ == "__main__":

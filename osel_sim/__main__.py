@@ -16,9 +16,15 @@ COMMANDS = {
     "collect": "demonstrations of the scripted expert",
     "train": "a policy from demonstrations, or the context encoder",
     "serve": "a policy over WebSocket",
+    "suites": "tasks of others: what is there, and how to get it",
     "gallery": "a contact sheet of tasks and levels",
     "doctor": "what works on this machine, and what is missing",
 }
+
+
+def module(command: str) -> str:
+    """The module of a command: `osel_sim.COMMAND`, but for `suites`, which is a package."""
+    return "osel_sim.cli.suites_command" if command == "suites" else f"osel_sim.{command}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     this_python.check()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and words[0] in COMMANDS:
-        code: int = import_module(f"osel_sim.{words[0]}").main(words[1:])
+        code: int = import_module(module(words[0])).main(words[1:])
         return code
     if words and words[0] == "--install-completion":
         return _install_completion()
@@ -50,7 +56,12 @@ def _install_completion() -> int:
 
     app = App(name="osel-sim", version_flags=[])
     for name in COMMANDS:
-        command = import_module(f"osel_sim.{name}")
+        command = import_module(module(name))
+        if name == "suites":
+            app.command(App(name=name), name=name)
+            for action, one in command.commands.items():
+                app[name].command(one.app(action), name=action)
+            continue
         found = command.main if isinstance(command.main, Command) else command.policy_command
         app.command(found.app(name), name=name)
 

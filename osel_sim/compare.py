@@ -30,7 +30,7 @@ def _execute(config: CompareConfig) -> int:
         print_plan(console(), found.result)
     else:
         print_compare(console(), found.result)
-    for file in (found.file, config.markdown, config.junit):
+    for file in (found.file, found.page, config.markdown, config.junit):
         if file is not None:
             print(f"written to {file}")
     if config.plan or found.decision != "not enough data":

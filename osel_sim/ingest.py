@@ -30,6 +30,9 @@ EXAMPLES = """examples:
   python -m osel_sim.ingest --files answers.jsonl --text question --policy-column model --success scores.exact --seconds time_ms/1000 \\
       --price usage.usd --price-unit usd --out logs/theirs
 
+  # what lerobot-eval or vla-eval measured, a file a policy; episodes are paired by task and seed
+  python -m osel_sim.ingest --results small=runs/small/eval_info.json large=runs/large/eval_info.json --price small=0 large=12 --out logs/theirs
+
   # decisions that were made, with the probability of each choice: what would others have earned?
   python -m osel_sim.ingest --files requests.parquet --text prompt --policy-column model --success ok --propensity p --out logs/requests
 

@@ -3,11 +3,14 @@
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from osel_sim.api.record import RecordConfig
 from osel_sim.cli.command import Command
 from osel_sim.core.errors import DataError, SettingError
+
+if TYPE_CHECKING:
+    from osel_sim.api.results import RecordResult
 
 EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --instances 200 --out logs/mine
@@ -17,11 +20,14 @@ EXAMPLES = """examples:
   python -m osel_sim.record --resume --out logs/mine --encoder ViT-L-14:openai             # read the log with another encoder from now on
   python -m osel_sim.record --task pick_place --instances 50 --repeats 4 --workers 8 --policies local_small --out logs/small
   python -m osel_sim.record --task all --instances 300 --level 0 1 2 3 --repeats 3 --repeat-every 10 --out logs/suite
+  python -m osel_sim.record --task pick_place --policies old new --instances 500 --until-decided --out logs/which    # stop as soon as it is told
+  python -m osel_sim.record --policies new --baseline logs/old --until-decided --out logs/new     # the same, against a log, on its instances
   python -m osel_sim.record --summary logs/mine                                            # print the tables of a log again
 
 Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.npz. Every policy starts from the same state of the same instance. The
 files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies, more
-repeats and an encoder given with it are added to what is there, and the log is read with the encoder given last."""
+repeats and an encoder given with it are added to what is there, and the log is read with the encoder given last.
+--until-decided looks after every 10 instances or more, --instances being the most; docs/compare.md says why such looks are honest."""
 
 
 def _execute(config: RecordConfig) -> int:
@@ -35,8 +41,22 @@ def _execute(config: RecordConfig) -> int:
         )
     _print_summary(result.folder)
     print(f"written to {result.folder}")
+    if result.planned:
+        _print_decision(result)
     _print_next(result.folder)
     return 0
+
+
+def _print_decision(result: "RecordResult") -> None:
+    from osel_sim.core.shown import shown
+
+    if result.verdict:
+        print(shown(result.verdict))
+    if result.spared:
+        saved = f"{result.spared} of {result.spared + len(result.rows)} planned episodes were not needed"
+        print(f"stopped after {result.instances} of {result.planned} instances: {saved}")
+    else:
+        print(f"all {result.planned} instances were needed")
 
 
 def _print_next(folder: Path) -> None:

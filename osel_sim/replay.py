@@ -19,7 +19,9 @@ Instances on which some policy has no valid outcome are left out and counted. Th
 A log has no price lists: what policies cost, auto is told from the other half where --half is given, else from the log itself.
 With --half a selector that learns off-policy can be shown all outcomes of the other half before its stream begins: auto:warm, linucb:warm ...
 
-Once that is said and written, selectors are replayed at other weights of time and price too, for the frontier: about half as long again.
+A verdict comes first, from auto, linucb and the fixed policies; then all other selectors are replayed, of which the paper's PPO takes longest, and
+at last all of them at other weights of time and price, for the frontier (--no-frontier leaves that out). After each of the three what is known so far
+is written, page included with --open: Ctrl-C loses no more than what is being replayed.
 
 Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv, frontier.csv. Of a live run's folder it estimates
 what each fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes.
@@ -32,15 +34,20 @@ def _execute(config: ReplayConfig) -> int:
 
     result = replay(config, on_result=_print)
     print(f"written to {result.folder}")
-    page = result.folder if result.result is not None else config.log  # of estimates alone: the page is the run's, or the log's
-    print_next(("makes a page of it", "report", [page, "--open"]))
+    if not config.open:
+        page = result.folder if result.result is not None else config.log  # of estimates alone: the page is the run's, or the log's
+        print_next(("makes a page of it", "report", [page, "--open"]))
     return 0
 
 
 def _print(result: ReplayResult) -> None:
+    """The verdict so far, while more is to come; in the end everything."""
     from osel_sim.cli.console import console
-    from osel_sim.cli.replay_tables import print_off_policy, print_replay
+    from osel_sim.cli.replay_tables import print_off_policy, print_replay, print_so_far
 
+    if result.result is not None and result.pending:
+        print_so_far(console(), result.result)
+        return
     if result.off_policy is not None:
         print_off_policy(console(), result.off_policy)
     if result.result is not None:

@@ -1,4 +1,4 @@
-"""Write the page of a live run, a replay or a rollout log: `python -m osel_sim.report runs/first`."""
+"""Write the page of a live run, a replay, a comparison or a rollout log: `python -m osel_sim.report runs/first`."""
 
 import sys
 
@@ -9,6 +9,7 @@ EXAMPLES = """examples:
   python -m osel_sim.report runs/first --open              # a live run (osel_sim.run)
   python -m osel_sim.report runs/first --watch             # a live run that goes on: the page grows with it
   python -m osel_sim.report replays/first                  # a replay (osel_sim.replay)
+  python -m osel_sim.report runs/compared                  # a comparison (osel_sim.compare --out)
   python -m osel_sim.report assets/logs/pick_place --out /tmp/page --alpha-price 0.02     # a rollout log (osel_sim.record)
 
 Writes report.html, one file that needs no network, with figures/*.png, figures/*.svg and tables/*.csv beside it."""

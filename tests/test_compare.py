@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -121,6 +122,24 @@ def test_logs_that_are_not_of_the_same_scenes_are_refused_by_name(tmp_path, valu
         osel.compare(one, other)
 
 
+def test_pairs_of_other_scenes_are_refused_by_name_and_unknown_ones_said(tmp_path):
+    def scenes(rows: list[Row], changed: range = range(0), known: range = range(20)) -> list[Row]:
+        return [replace(row, scene=f"{row.seed}{'!' if row.seed in changed else ''}" if row.seed in known else None) for row in rows]
+
+    first, second = rows_of("a", [True] * 20), rows_of("b", [False] * 20)
+    one = log_of(tmp_path / "one", scenes(first))
+    for name, changed, message in (("some", range(3, 6), ", nor are 2 others of 20: "), ("single", range(3, 4), ": assets")):
+        other = log_of(tmp_path / name, scenes(second, changed))
+        with pytest.raises(DataError, match=f"'lift/test/0/3' is not the same scene in .*one and in .*{name}{message}"):
+            osel.compare(one, other)
+    same = osel.compare(one, log_of(tmp_path / "same", scenes(second)), markdown=tmp_path / "same.md")
+    assert same.result["pairs"][0]["same_scene"] == 20 and "key alone" not in (tmp_path / "same.md").read_text()
+    half = osel.compare(one, log_of(tmp_path / "half", scenes(second, known=range(15))), markdown=tmp_path / "half.md")
+    assert half.result["pairs"][0]["same_scene"] == 15 and "tell the scenes of 5 of them" in (tmp_path / "half.md").read_text()
+    osel.compare(one, log_of(tmp_path / "old", second), markdown=tmp_path / "old.md")
+    assert "Paired by key alone" in (tmp_path / "old.md").read_text()
+
+
 def test_a_task_that_got_worse_is_named_though_the_whole_did_not(tmp_path):
     first, second = pattern(100, 0, 0, 0), pattern(10, 20, 0, 0)
     rows = [
@@ -155,15 +174,101 @@ def test_junit_says_what_the_exit_code_says(tmp_path, cells, kind):
     root = ElementTree.fromstring((tmp_path / "new" / "out.xml").read_text())
     (case,) = root.iter("testcase")
     assert [child.tag for child in case if child.tag != "system-out"] == ([kind] if kind else [])
-    assert root.attrib["failures"] == str(int(kind == "failure")) and root.attrib["skipped"] == str(int(kind == "skipped"))
+    (suite,) = root
+    assert (root.tag, suite.tag) == ("testsuites", "testsuite") and suite.attrib["name"] == case.attrib["classname"] == "osel_sim.compare"
+    assert root.attrib["failures"] == suite.attrib["failures"] == str(int(kind == "failure")) and suite.attrib["skipped"] == str(
+        int(kind == "skipped")
+    )
+    assert {"tests", "errors", "time"} <= suite.attrib.keys() and {"name", "time"} <= case.attrib.keys()
+    if kind:
+        assert case[0].attrib["message"] == case[0].text and "points of success" in str(case[0].text)
+
+
+NAMES = (
+    "a|b<script>alert(1)</script>",
+    "c\x1b[31m*d*",
+    "@somebody and #12",
+    "- [x](http://evil.example/?q=1)",
+    "two\nlines  of `it` \\",
+    "$x_1$ &amp; \uffff",
+)
 
 
 def test_names_of_others_are_neither_markup_nor_control_characters(tmp_path):
-    rows = [row for name in ("a|b<script>", "c\x1b[31m*d*") for row in rows_of(name, [True] * 20)]
-    osel.compare(log_of(tmp_path / "log", rows), markdown=tmp_path / "out.md", junit=tmp_path / "out.xml")
+    from markdown_it import MarkdownIt
+
+    odd = "a|<b>\nc"
+    rows = [row for name in NAMES for row in rows_of(name, [True] * 20) + rows_of(name, [name == NAMES[0]] * 20, task=odd)]
+    rows = [replace(row, instance=f"{odd}{row.seed}", seed=None, level=None, split=None) if row.task == odd else row for row in rows]
+    result = osel.compare(log_of(tmp_path / "log", rows), markdown=tmp_path / "out.md", junit=tmp_path / "out.xml", out=tmp_path / "out").result
     text = (tmp_path / "out.md").read_text()
-    assert "<script>" not in text and "\x1b" not in text and r"a\|b" in text and r"\*d\*" in text
-    ElementTree.fromstring((tmp_path / "out.xml").read_text())
+    assert "\x1b" not in text
+    html = MarkdownIt("commonmark").enable("table").render(text)
+    for markup in ("<script", "<em>", "<code>", "<a ", "<li>", "<h1>", "<b>", "<img"):
+        assert markup not in html, markup
+    assert html.count("<table>") == text.count("| --- |\n") and html.count("<strong>") == 1
+    for table in html.split("<table>")[1:]:
+        lines = [line.count("<td") + line.count("<th") for line in table.split("</table>")[0].split("<tr>")[1:]]
+        assert len(set(lines)) == 1, "every row has as many cells as the headings"
+    for mention in ("@somebody", "#12", "http://evil"):
+        assert mention not in html
+    cases = list(ElementTree.fromstring((tmp_path / "out.xml").read_bytes()).iter("testcase"))
+    assert len(cases) == len(NAMES) - 1 and "<script>" in cases[0].attrib["name"]
+    assert len(result["pairs"]) == 15
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "alert(1)</script>" not in page and "\x1b" not in page
+
+
+def test_a_page_shows_the_comparison_and_a_damaged_one_is_refused(tmp_path, capsys):
+    generator = np.random.default_rng(3)
+    rows = [
+        row
+        for name, rate in (("a", 0.5), ("b", 0.9), ("c", 0.5))
+        for task in ("lift", "push")
+        for row in rows_of(name, generator.random(60) < rate, task=task)
+    ]
+    out = tmp_path / "out"
+    found = osel.compare(log_of(tmp_path / "log", rows), out=out)
+    assert found.page == out / "report.html"
+    page = found.page.read_text()
+    assert "points of success" in page and "Who was told apart" in page
+    assert sorted(file.stem for file in (out / "tables").iterdir()) == ["differences", "flips", "letters", "means", "pairs", "tasks"]
+    written = {file: file.read_bytes() for file in out.rglob("*.*") if file.suffix != ".json"}
+    assert main(["report", str(out)]) == 0
+    assert written == {file: file.read_bytes() for file in written}, "the same page of what was written"
+    right = json.loads((out / "compare.json").read_text())
+    for keys, value, message in (
+        (("schema_version",), 2, "schema_version must be 1, got 2"),
+        (("schema_version",), True, "schema_version must be 1, got True"),
+        (("pairs", 0, "instances"), "120", "pairs.0.instances: Input should be a valid integer"),
+        (("pairs", 0, "instances"), 0, "pairs.0.instances: .*greater than or equal to 1"),
+        (("pairs", 1, "verdict", "decision"), "fine", "pairs.1.verdict.decision: .*'better', 'worse'"),
+        (("pairs", 0, "differences", "success", "ci95"), [1.0, 0.0], "pairs.0.differences.success: the ends of an interval"),
+        (("pairs", 0, "differences", "luck"), {}, "pairs.0.differences.luck"),
+        (("pairs", 0, "flips"), [], "pairs.0: flips must be the"),
+        (("pairs", 0, "test", "p"), float("nan"), "pairs.0.test.p"),
+        (("pairs",), [], "pairs must be all pairs"),
+        (("letters",), None, "letters are those of three policies or more"),
+        (("verdict", "exit_code"), 0, "exit_code must be the decision's"),
+        (("more",), 1, "more: Extra inputs"),
+    ):
+        data = json.loads(json.dumps(right))
+        place = data
+        for key in keys[:-1]:
+            place = place[key]
+        place[keys[-1]] = value
+        (out / "compare.json").write_text(json.dumps(data).replace("\n", "\r\n"))
+        with pytest.raises(DataError, match=f"compare.json.*{message}"):
+            osel.report(out)
+    (out / "compare.json").write_text(json.dumps({"schema_version": 1, "plan": []}))
+    with pytest.raises(DataError, match="is a plan, which compares nothing"):
+        osel.report(out)
+    (out / "compare.json").write_text(json.dumps(right, indent=1).replace("\n", "\r\n"))
+    assert osel.report(out).page.is_file()
+    with pytest.raises(SettingError, match="is no rollout log"):
+        osel.report(out, encoder="x")
+    with pytest.raises(UsageError, match="--open shows the page"):
+        osel.compare(tmp_path / "log", open=True)
 
 
 def test_a_plan_says_how_many_instances_it_takes(tmp_path, capsys):

@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 
-def run(code: str, **changes: str | None) -> subprocess.CompletedProcess[str]:
+def run(code: str | Path, *arguments: str, **changes: str | None) -> subprocess.CompletedProcess[str]:
     ours = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "MUJOCO_EGL_DEVICE_ID", "OSEL_SIM_GL_CHECKED")
     environment = {key: value for key, value in os.environ.items() if key not in ours}
     environment.update({key: value for key, value in changes.items() if value is not None})
-    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    command = [str(code)] if isinstance(code, Path) else ["-c", code]
+    return subprocess.run([sys.executable, *command, *arguments], env=environment, capture_output=True, text=True, timeout=120)
 
 
 CHOOSE = "import os; from osel_sim.sim import gl; print(gl.find_backend(), os.environ['MUJOCO_GL'], os.environ['PYOPENGL_PLATFORM'])"
@@ -82,10 +83,10 @@ import numpy as np
 from osel_sim.core.errors import DisplayError
 from osel_sim.sim.env import TaskEnv
 env = TaskEnv("lift", cameras=("agentview",), image_size=32)
-before = env.reset(seed=1)[0]["observation.images.agentview"].copy()
+before = env.reset(seed=1)[0]["image_agentview"].copy()
 child = os.fork()
 try:
-    print("child" if child == 0 else "parent", np.array_equal(before, env.reset(seed=1)[0]["observation.images.agentview"]), flush=True)
+    print("child" if child == 0 else "parent", np.array_equal(before, env.reset(seed=1)[0]["image_agentview"]), flush=True)
 except DisplayError as error:
     print(str(error).partition(": start")[0], flush=True)
 if child == 0:
@@ -98,6 +99,52 @@ os.waitpid(child, 0)
 def test_a_process_may_fork_after_it_drew(backend: str, says: str) -> None:
     done = run(FORK, MUJOCO_GL=backend)
     assert says in done.stdout and "parent True" in done.stdout, done.stdout + done.stderr
+
+
+VECTOR = """
+import sys
+import gymnasium
+import mujoco
+import osel_sim.envs
+if __name__ == "__main__":
+    who, start = sys.argv[1:]
+    if who != "ours":  # another program's image, whose context is closed again, or kept
+        model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+        renderer = mujoco.Renderer(model, 16, 16)
+        renderer.render()
+        if who != "kept":
+            renderer.close()
+    else:
+        ours = gymnasium.make("osel_sim/lift-v0", render_mode="rgb_array")
+        ours.reset(seed=1)
+        ours.render()
+    envs = gymnasium.make_vec(
+        "osel_sim/lift-v0", 2, "async", vector_kwargs=None if start == "fork" else {"context": start}, cameras=("agentview",), image_size=32
+    )
+    try:
+        print("drawn", envs.reset(seed=1)[0]["image_agentview"].shape)
+    except Exception as error:
+        print(type(error).__name__, error)
+    envs.close(terminate=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("who", "start", "backend", "says"),
+    [
+        ("ours", "fork", "egl", "drawn (2, 32, 32, 3)"),
+        ("closed", "fork", "egl", "drawn (2, 32, 32, 3)"),
+        ("kept", "fork", "egl", "DisplayError this process was forked from one that had drawn images (egl)"),
+        ("kept", "fork", "osmesa", "DisplayError this process was forked from one that had drawn images (osmesa)"),
+        pytest.param("kept", "spawn", "egl", "drawn (2, 32, 32, 3)", marks=pytest.mark.slow),
+        pytest.param("ours", "spawn", "osmesa", "drawn (2, 32, 32, 3)", marks=pytest.mark.slow),
+    ],
+)
+def test_gymnasiums_vector_of_processes_draws_or_says_why_not(who: str, start: str, backend: str, says: str, tmp_path: Path) -> None:
+    script = tmp_path / "vector.py"
+    script.write_text(VECTOR)
+    done = run(script, who, start, MUJOCO_GL=backend)
+    assert says in done.stdout, done.stdout + done.stderr
 
 
 def test_a_child_process_does_not_probe_again() -> None:

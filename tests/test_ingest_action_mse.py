@@ -68,7 +68,7 @@ def test_who_knows_the_answer_has_no_error_and_a_crash_is_no_score(dataset):
 
     def ask(off):
         driver = Driver(spec, LocalCaller(Replays(logged, off), spec, specification()))
-        return measure_one(sample, driver, sample.dataset.observation(sample.frame), 0.05)
+        return measure_one(sample, driver, sample.observations(1), 0.05)
 
     right, wrong, crashed = ask(0.0), ask(0.3), ask(None)
     assert (right.score, right.success, right.actions) == (0.0, True, STEPS - 8)

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as parquet
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 from synthetic_demonstrations import SIZE, STEPS, write
 
 from osel_sim.core.errors import ContentError, DataError
@@ -19,6 +20,7 @@ from osel_sim.formats.dataset_mapping import DatasetMapping, load_dataset_mappin
 from osel_sim.ingestion.action_mse import Measurement, open_datasets
 from osel_sim.ingestion.lerobot_check import open_dataset
 from osel_sim.ingestion.lerobot_numbers import actions, check_mapping, states
+from osel_sim.policy.mapping import hand_orientation
 from osel_sim.training.dataset import load_demonstrations
 
 FRAMES = "data/chunk-000/file-000.parquet"
@@ -172,6 +174,22 @@ def test_a_datasets_own_conventions(dataset: Path, caplog: pytest.LogCaptureFixt
         check_mapping(DatasetMapping(scale=(1.0,)), mapping, ("agentview",))
     with pytest.raises(ContentError, match=r"images\.front: no policy has that camera"):
         check_mapping(DatasetMapping(images={"front": "x"}), mapping, ("agentview",))
+
+
+def test_mirrored_images_and_the_hands_orientation_become_ours(dataset: Path) -> None:
+    ours = states(open_dataset(dataset), DatasetMapping())
+    grips = Rotation.random(len(ours), random_state=0).as_rotvec()
+    hands = [hand_orientation(grip)["axis_angle"] for grip in grips]
+    change(dataset / FRAMES, "observation.state", lambda rows: [[*row[:3], *hand, *row[6:]] for row, hand in zip(rows, hands, strict=True)])
+    picture = np.arange(SIZE * SIZE * 3, dtype=np.uint32).reshape(SIZE, SIZE, 3).astype(np.uint8)
+    change(dataset / FRAMES, IMAGE, lambda values: [png(Image.fromarray(picture[:, ::-1]))] * len(values))
+    mapping = DatasetMapping(flip={"agentview": "horizontal"}, state_frame="hand")
+    data = load_demonstrations(dataset, ("agentview",), progress=False, mapping=mapping)
+    for found, grip in zip(data.state, grips, strict=True):
+        assert (Rotation.from_rotvec(found[3:6]) * Rotation.from_rotvec(grip).inv()).magnitude() == pytest.approx(0, abs=1e-5)
+    assert np.array_equal(data.state[:, [0, 1, 2, 6, 7]], ours[:, [0, 1, 2, 6, 7]])
+    samples = open_datasets([dataset], [library.load_policy("local_small")], Measurement(mapping=mapping))
+    assert np.array_equal(data.images["agentview"][0], picture) and np.array_equal(samples[0].dataset.images(3)[0], picture)
 
 
 def test_actions_in_other_units_are_warned_of(dataset: Path, caplog: pytest.LogCaptureFixture) -> None:

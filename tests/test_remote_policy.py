@@ -19,7 +19,7 @@ from osel_sim.remote.client import RemoteClient
 from osel_sim.remote.codec import pack
 from osel_sim.remote.network import PROFILES, NetworkModel, NetworkProfile
 from osel_sim.remote.policy import RemotePolicy, check_servers, open_remote
-from osel_sim.remote.process import PolicyServerProcess
+from osel_sim.remote.policy_process import PolicyServerProcess
 
 
 @pytest.fixture(scope="module")
@@ -308,7 +308,7 @@ def test_the_server_dies_with_its_parent_however_that_dies(plugin):
     policy_spec(plugin)
     script = (
         "import sys, time\nfrom pathlib import Path\nfrom osel_sim.formats.policy_file import load_policy_file\n"
-        "from osel_sim.remote.process import PolicyServerProcess\nfrom osel_sim.interface.specification import specification\n"
+        "from osel_sim.remote.policy_process import PolicyServerProcess\nfrom osel_sim.interface.specification import specification\n"
         "server = PolicyServerProcess(load_policy_file(Path(sys.argv[1])), specification())\nserver.start()\n"
         "print(server.pid, flush=True)\ntime.sleep(1000)\n"
     )

@@ -67,7 +67,7 @@ def test_openpis_own_client_is_served(url):
     assert client.infer(observation("abc"))["actions"][0, 1] == np.float32(0.02)
     assert client.infer(observation("another"))["actions"][0, 1] == np.float32(0.01)
     with pytest.raises(RuntimeError, match=r"ObservationError: expected the keys .*observation\.state"):
-        client.infer({"observation/image": np.zeros((224, 224, 3), np.uint8), "prompt": "x"})
+        client.infer({"observation/exterior_image_1_left": np.zeros((224, 224, 3), np.uint8), "prompt": "x"})
     assert client.infer(observation("another"))["actions"][0, 1] == np.float32(0.02)
 
 

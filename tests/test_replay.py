@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 from synthetic_log import clusters, make_row, write_log
 
-from osel_sim.analysis.engine import Setup
+from osel_sim.analysis.engine import Part, Setup
 from osel_sim.analysis.engine import replay as replay_all
 from osel_sim.analysis.gains import Gain
 from osel_sim.analysis.log import read_log
@@ -23,6 +23,7 @@ from osel_sim.analysis.measures import Curves, gap_closed
 from osel_sim.api.replay import replay
 from osel_sim.cli.replay_tables import print_replay
 from osel_sim.core.errors import DataError
+from osel_sim.core.interrupts import uninterrupted
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.formats.rollout_log import write_rollouts
 from osel_sim.interface.selector import Choice
@@ -284,7 +285,9 @@ def test_workers_do_not_matter(log):
     names = ["ppo_tuned", "linucb", "epsilon_greedy"]
     outcomes = read_log(log)
     setups = [Setup(RewardWeights(0.0, 0.0)), Setup(RewardWeights(0.1, 0.0), {"linucb": {"optimism": 5.0}})]
-    one, two = (replay_all(outcomes, setups, names, range(2), 90, workers) for workers in (1, 2))
+    parts = [Part(outcomes, setups, names, range(2), 90), Part(outcomes, setups[1:], ["thompson"], range(1), 20)]
+    (one, last), (two, again) = (list(replay_all(parts, workers)) for workers in (1, 2))
+    assert (last[0].chosen["thompson"] == again[0].chosen["thompson"]).all()
     for number in range(2):
         assert (one[number].order == two[number].order).all()
         assert all((one[number].chosen[name] == two[number].chosen[name]).all() for name in names)
@@ -293,14 +296,57 @@ def test_workers_do_not_matter(log):
 
 def test_a_selector_sees_the_outcomes_of_its_choices_only(log, monkeypatch):
     outcomes = read_log(log)
-    (first,) = replay_all(outcomes, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)
+    [[first]] = replay_all([Part(outcomes, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)])
     chosen = np.zeros_like(outcomes.success, bool)
     rows = first.order[0]
     chosen[rows, first.chosen["linucb"][0], 0] = True
     other = read_log(log)
     other.success[~chosen] = 1.0 - other.success[~chosen]
-    (again,) = replay_all(other, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)
+    [[again]] = replay_all([Part(other, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)])
     assert (again.chosen["linucb"] == first.chosen["linucb"]).all()
+
+
+def test_a_verdict_comes_first_and_all_is_written_as_it_comes(tmp_path: Path, log, capsys):
+    """Interrupted while it replays what comes last, a replay leaves all that was told before; in the end nothing tells that it came in stages."""
+    settings = {"seeds": 2, "decisions": 60, "workers": 1, "alpha_time": 0, "alpha_price": 0.1}
+    told = []
+
+    def tell(result):
+        written, choices = read_replay(result.folder)
+        assert written["verdict"]["text"] == result.verdict and set(choices.chosen) == set(written["selectors"])
+        told.append((result.pending, {name for name in choices.chosen if ":" not in name and "single" not in name}, bool(written["frontier"])))
+        if len(told) == 2:
+            raise KeyboardInterrupt
+
+    out, names = tmp_path / "out", ["thompson", "linucb", "random"]
+    with pytest.raises(KeyboardInterrupt):
+        replay(log, selectors=names, on_result=tell, out=out, **settings)
+    assert told == [(["thompson", "random", "frontier"], {"linucb"}, False), (["frontier"], set(names), False)]
+    assert read_replay(out)[0]["pending"] == ["frontier"]
+    assert report_main([str(out), "--out", str(tmp_path / "page")]) == 0
+    assert "still being replayed: frontier" in (tmp_path / "page" / "report.html").read_text()
+    flags = [word for name, value in settings.items() for word in (f"--{name.replace('_', '-')}", value)]
+    capsys.readouterr()
+    assert run(log, "--selectors", *names, "--out", out, "--overwrite", *flags) == 0
+    shown = capsys.readouterr().out
+    first, last = shown.index("So far, from linucb and the fixed policies:"), shown.rindex("thompson")
+    assert first < shown.index("Still being replayed: thompson, random, frontier; Ctrl-C keeps what is there") < last
+    result, _ = read_replay(out)
+    assert "pending" not in result and set(result["frontier"]["alpha_price"]["selectors"]) == {"thompson", "linucb"}
+    assert list(result["selectors"])[:3] == names
+    again = replay(log, selectors=names, out=tmp_path / "again", **settings)
+    assert again.pending == [] and (tmp_path / "again" / "replay.json").read_bytes() == (out / "replay.json").read_bytes()
+
+
+def test_ctrl_c_waits_for_what_is_written_together():
+    done, before = [], signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), uninterrupted():
+            signal.raise_signal(signal.SIGINT)
+            done.append("all")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done == ["all"]
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ def test_wrong_logs_are_refused(tmp_path):
     with pytest.raises(DataError, match="not a Parquet file"):
         read_rollouts(tmp_path)
     pyarrow.parquet.write_table(pyarrow.table({"a": [1]}), tmp_path / "rollouts.parquet")
-    with pytest.raises(DataError, match="schema_version must be 1 to 4, got None"):
+    with pytest.raises(DataError, match="schema_version must be 1 to 5, got None"):
         read_rollouts(tmp_path)
 
 
@@ -116,11 +116,24 @@ def test_a_log_of_version_1_is_read_without_scores_and_axes(tmp_path):
     pyarrow.parquet.write_table(old.append_column("score", [[0.5, 0.25]]), file)
     with pytest.raises(DataError, match="columns must be"):
         read_rollouts(tmp_path)
-    pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"5"}), file)
-    with pytest.raises(DataError, match="schema_version must be 1 to 4, got 5"):
+    pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"6"}), file)
+    with pytest.raises(DataError, match="schema_version must be 1 to 5, got 6"):
         read_rollouts(tmp_path)
     pyarrow.parquet.write_table(table.replace_schema_metadata({b"osel_sim.schema_version": b"3 or so"}), file)
     with pytest.raises(DataError, match="metadata cannot be read"):
+        read_rollouts(tmp_path)
+
+
+def test_a_log_that_tells_scenes_tells_one_of_each_instance(tmp_path):
+    rows = [row(scene=None, error="the worker process died"), row(policy="large", scene="a1"), row(1, scene="b2")]
+    write_rollouts(tmp_path, rows, {})
+    read, metadata = read_rollouts(tmp_path)
+    assert read == rows and metadata["schema_version"] == 5
+    write_rollouts(tmp_path, [*rows, row(policy="third", scene="a2")], {})
+    with pytest.raises(DataError, match="row 4: instance 'pick_place/test/0/0': its scene is 'a2', in an earlier row it is 'a1'"):
+        read_rollouts(tmp_path)
+    write_rollouts(tmp_path, [row(scene="")], {})
+    with pytest.raises(DataError, match="column 'scene', row 1: must be text that is not empty or null"):
         read_rollouts(tmp_path)
 
 

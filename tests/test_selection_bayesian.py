@@ -9,6 +9,7 @@ import pytest
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.episodes.expected_costs import expected_costs
 from osel_sim.formats.policy_file import PolicySpec, Price, Remote
+from osel_sim.interface.selector import Choice
 from osel_sim.interface.specification import specification
 from osel_sim.selection.features import Components, Landmarks, Sketch
 from osel_sim.selection.kernel_ucb import KernelUCBSelector
@@ -121,6 +122,24 @@ def test_state_round_trip_is_bit_identical(name, stop, tmp_path):
     ended, resumed = whole.state_dict(), second.state_dict()
     assert ended.keys() == resumed.keys()
     assert all(np.array_equal(ended[key], resumed[key]) for key in ended)
+
+
+@pytest.mark.parametrize("name", ["auto", "neural_linear"])
+def test_outcomes_learned_together_leave_what_they_leave_one_by_one(name):
+    contexts, rewards, _ = clusters(8, 70)
+    together, one_by_one = (make_selector(name, POLICIES, 40, seed=0) for _ in range(2))
+    for number, (context, row) in enumerate(zip(contexts, rewards, strict=True)):
+        choice = Choice(POLICIES[number % 3], dict.fromkeys(POLICIES, 1 / 3))
+        for selector in (together, one_by_one):
+            selector.update(context, choice, row[number % 3])
+        assert one_by_one.signal > 0.0  # asked, it has to have learned
+    ends = [selector.state_dict() for selector in (together, one_by_one)]
+    assert all(np.array_equal(ends[0][key], ends[1][key]) for key in ends[1])
+    context = contexts[0].copy()
+    choice = together.select(context)
+    context[:] = contexts[1]  # a buffer that is used again: what was selected on is not what is learned from
+    together.update(context, choice, 1.0)
+    assert (together.state_dict()["contexts"][-1] == contexts[1]).all()
 
 
 @pytest.mark.parametrize("name", CONTEXTUAL)

@@ -82,3 +82,14 @@ def test_tables_that_do_not_fit():
         table_rounds(np.zeros((3, 2)), np.zeros((4, 2)))
     with pytest.raises(UsageError):
         table_rounds(np.zeros((0, 2)), np.zeros((0, 2)))
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_tables_without_every_number_are_refused(number):
+    contexts, rewards = table()
+    rewards[[3, 4], 1] = number
+    with pytest.raises(UsageError, match=rf"rewards\[3, 1\] is {number} \(2 of 50 rows have such\)"):
+        table_rounds(contexts, rewards)
+    contexts[0, 2] = number
+    with pytest.raises(UsageError, match=r"contexts\[0, 2\]"):
+        table_rounds(contexts, rewards)

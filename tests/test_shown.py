@@ -49,6 +49,7 @@ def test_control_characters_become_visible() -> None:
     assert not RAW.search(text) and text.startswith(r"a\x1b[2J\x1b]0;title\x07b\x9b31mc\x08\x7fd\rfake\u202eEVIL\u2066\u2028\x00\U000e0041")
     assert printable(text) == text
     printable("caf\udce9").encode()  # a file name that is not UTF-8
+    assert printable("a\ufffe\uffffb") == r"a\ufffe\uffffb"  # what draws an SVG with one ends the process
 
 
 @pytest.mark.parametrize("address", ADDRESSES)

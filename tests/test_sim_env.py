@@ -1,13 +1,16 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
+from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
+import osel_sim
 from osel_sim.core import content
 from osel_sim.core.errors import UsageError
 from osel_sim.formats.task_file import load_task_file
@@ -46,6 +49,23 @@ def test_passes_the_checkers_of_gymnasium_and_sb3():
     made.close()
 
 
+def test_sb3_learns_from_its_observations():
+    made = osel_sim.make_env("lift", cameras=CAMERAS, image_size=40)
+    model = PPO("MultiInputPolicy", made, n_steps=4, batch_size=4, n_epochs=1, device="cpu").learn(4)
+    assert model.num_timesteps == 4 and set(made.observation_space) == {"state", "image_agentview", "image_wrist"}
+    made.close()
+
+
+def test_observations_are_those_of_observe_under_names_without_dots(env):
+    watched = TaskEnv(env.task, cameras=CAMERAS, image_size=48)
+    observation, _ = watched.reset(seed=1)
+    shown = watched.observe(CAMERAS, 48)
+    np.testing.assert_array_equal(observation["state"], shown["observation.state"])
+    for camera in CAMERAS:
+        np.testing.assert_array_equal(observation[f"image_{camera}"], shown[f"observation.images.{camera}"])
+    watched.close()
+
+
 @pytest.mark.parametrize(
     "action",
     [np.zeros(6), np.zeros((1, 7)), np.zeros(8), 0.0, None, "up", [0.0] * 6 + ["open"], [[0.0], [0.0, 1.0]], np.zeros(7, bool), np.zeros(7, complex)],
@@ -66,7 +86,7 @@ def test_an_action_of_no_numbers_is_refused_and_a_large_one_is_clipped(env):
     states = []
     for size in (1.0, 50.0):
         env.reset(seed=0)
-        states.append(env.step([size] * 6 + [-size])[0]["observation.state"])
+        states.append(env.step([size] * 6 + [-size])[0]["state"])
     np.testing.assert_array_equal(*states)
 
 
@@ -141,6 +161,42 @@ def test_images_are_the_same_each_time_and_differ_between_scenes(env):
         assert first[key].shape == (64, 64, 3) and first[key].dtype == np.uint8
     assert first["observation.state"].shape == (8,) and np.isfinite(first["observation.state"]).all()
     assert first["task"] == make_instance(env.task, 1).instruction
+
+
+def test_a_scene_is_told_by_all_that_an_episode_depends_on(env):
+    task = env.task
+    plain = make_instance(task, 3)
+    env.load(plain)
+    digest, world = env.scene_digest(), env.world
+    env.advance(np.ones(7))
+    assert env.scene_digest() == digest, "what happens later is not how it began"
+    twin = TaskEnv(task)
+    twin.load(make_instance(task, 4))
+    snapshot = twin.snapshot()
+    other = twin.scene_digest()
+    twin.load(plain)
+    assert twin.scene_digest() == digest != other
+    twin.restore(snapshot)
+    assert twin.scene_digest() == other
+    twin.close()
+    moved = replace(plain, placements=(replace(plain.placements[0], x=plain.placements[0].x + 1e-4), *plain.placements[1:]))
+    last_bits = replace(plain, placements=(replace(plain.placements[0], x=plain.placements[0].x + 1e-15), *plain.placements[1:]))
+    named = replace(plain, instruction="do something else")
+    perturbed = [make_instance(task, 3, axes={axis: 3}) for axis in task.axes if axis != "phrasing"]
+    told = {digest}
+    for instance in (moved, named, make_instance(task, 3, split="train"), *perturbed):
+        env.load(instance)
+        told.add(env.scene_digest())
+    assert len(told) == 4 + len(perturbed), "every axis shows"
+    env.load(last_bits)
+    assert env.scene_digest() == digest, "the last bit does not"
+    for field in ("body_mass", "geom_friction"):
+        array = getattr(world.model, field)
+        was = array.copy()
+        array *= 1.1
+        assert env.scene_digest() != digest, field
+        array[:] = was
+    assert env.scene_digest() == digest
 
 
 def test_a_snapshot_goes_on_to_the_same_bits_also_in_another_environment(env):

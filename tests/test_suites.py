@@ -360,6 +360,38 @@ def test_chunks_sent_at_once_are_the_same_episode(mode):
     assert several.messages < len(several.made) / 2
 
 
+class Looking(Eastwards):
+    """The same, noting at which control steps the images it is shown were taken."""
+
+    def __init__(self, seconds):
+        super().__init__(seconds)
+        self.seen = []
+
+    def call(self, observation):
+        self.seen.append(observation["observation.images.top"][:, 0, 0, 0].tolist())
+        return replace(super().call(observation), actions=np.ones((12, 3), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("mode", "execute", "calls"), [(None, 4, [0, 4, 8, 12, 16]), (None, 1, [*range(20)]), ("blocking", 4, [0, 7, 14]), ("async", 2, None)]
+)
+@pytest.mark.parametrize("kind", [Logged, LoggedInChunks])
+def test_a_policy_with_a_history_sees_the_steps_before_the_call(kind, mode, execute, calls):
+    class Counted(kind):
+        def render(self, camera):
+            return np.full((64, 64, 3), self.steps, np.uint8)
+
+    env, caller = Counted(), Looking(0.25 if mode else 0.0)
+    spec = load_policy_file(POLICIES / f"toy_{'reader' if mode else 'greedy'}.toml")
+    spec = replace(spec, execute=execute, history=3, cameras=("top",), remote=replace(spec.remote, mode=mode) if mode else None)
+    instance = find_task("toy:reach").instance(3)
+    env.load(instance)
+    run_episode(env, instance, Driver(spec, caller))
+    called = [window[-1] for window in caller.seen]
+    assert caller.seen == [[max(0, step - 2), max(0, step - 1), step] for step in called]
+    assert called == calls if calls else called == sorted({*called}) and len(called) > 3
+
+
 def test_whoever_watches_steps_sees_all_of_them():
     class Steps(Subscriber):
         seen = 0

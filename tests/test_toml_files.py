@@ -99,7 +99,7 @@ def chosen_by_the_writer(kind: str, place: tuple[str, ...]) -> bool:
         "task": place[0] in ("roles", "unnamed", "subgoals") and len(place) == 2,
         "catalogue": len(place) == 2,
         "recipe": place[:2] == ("data", "weights") and len(place) == 3,
-        "policy": place[:2] == ("mapping", "images") and len(place) == 3,
+        "policy": place[:2] in (("mapping", "images"), ("mapping", "flip")) and len(place) == 3,
         "table-mapping": place[0] == "policies" and len(place) == 2,
     }[kind]
 

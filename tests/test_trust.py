@@ -96,7 +96,7 @@ def test_no_command_runs_it(folder: Path, tmp_path: Path, capsys: pytest.Capture
         ({"class": "lerobot.robots.utils.Popen"}, "cannot be imported"),
         ({"class": "lerobot.processor.pipeline.re"}, "is no ProcessorStep"),
         ({"class": "osel_sim.remote.process.subprocess.Popen"}, "cannot be imported"),
-        ({"class": "osel_sim.remote.process.PolicyServerProcess"}, "is no ProcessorStep"),
+        ({"class": "osel_sim.remote.policy_process.PolicyServerProcess"}, "is no ProcessorStep"),
         ({"class": "lerobot.processor.pipeline.ProcessorStep.__subclasses__"}, "--trust"),
         ({"class": "lerobotx.processor.Step"}, "--trust lerobotx.processor"),
         ({"class": "osel_sim_extra.Step"}, "--trust osel_sim_extra"),

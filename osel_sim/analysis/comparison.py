@@ -9,15 +9,12 @@ import numpy as np
 
 from osel_sim.analysis.log import Array
 from osel_sim.analysis.pairing import MEASURES, Contender, Pairs, pair
+from osel_sim.analysis.until_decided import ERROR, FEWEST
+from osel_sim.formats.compare_schema import EXIT_CODES, Decision
 from osel_sim.selection.reward import RewardWeights
+from osel_sim.statistics.intervals import Interval
 from osel_sim.statistics.paired import Discordance, holm, letters, mean_interval, sign_flip_midp, success_interval
-
-Decision = Literal["better", "worse", "no worse", "not enough data"]
-ERROR = 0.05
-"""Probability of telling policies apart that are equally good, all pairs together."""
-FEWEST = 10
-"""With fewer pairs nothing is claimed."""
-EXIT_CODES: dict[Decision, int] = {"better": 0, "no worse": 0, "worse": 1, "not enough data": 3}
+from osel_sim.statistics.sequential import anytime_bounds, anytime_p, pairs_to_tell
 
 
 def compare(contenders: Sequence[Contender], weights: RewardWeights, margin: float, power: float = 0.8) -> dict[str, Any]:
@@ -94,10 +91,12 @@ def _compared(pairs: Pairs, adjusted: float, comparisons: int, margin: float, po
         "pairs_of_repeats": pairs.repeats,
         "unpaired": {"first": pairs.only_first, "second": pairs.only_second},
         "errors": {"first": pairs.errors[0], "second": pairs.errors[1]},
+        "same_scene": pairs.scenes,
+        "looks": None if pairs.looks is None else len(pairs.looks.ends),
         "differences": measured,
         "missing": dict(pairs.missing),
         "test": {
-            "method": "exact McNemar, mid-p" if whole else "sign flips of the instances' differences, mid-p",
+            "method": _method(pairs, whole),
             "gained": int((differences > 0.0).sum()),
             "lost": int((differences < 0.0).sum()),
             "p": _probability(pairs),
@@ -119,7 +118,7 @@ def _difference(pairs: Pairs, measure: str) -> dict[str, Any] | None:
     known = np.isfinite(differences)
     if not known.any():
         return None
-    interval = success_interval(differences, most=pairs.repeats) if measure == "success" else mean_interval(differences[known])
+    interval = _bounds(pairs, ERROR) if measure == "success" else mean_interval(differences[known])
     return {
         "instances": int(known.sum()),
         "first": float(pairs.first_values[measure][known].mean()),
@@ -160,7 +159,7 @@ def _told_apart(differences: Array, adjusted: float) -> Literal["better", "worse
 
 def _verdict(pairs: Pairs, adjusted: float, comparisons: int, margin: float, power: float) -> dict[str, Any]:
     differences = pairs.differences()
-    low, high = success_interval(differences, 1.0 - ERROR / comparisons, pairs.repeats)
+    low, high = _bounds(pairs, ERROR / comparisons)
     told = _told_apart(differences, adjusted)
     decision: Decision = "not enough data"
     if told == "better" and low > 0.0:
@@ -189,14 +188,36 @@ def _text(pairs: Pairs, decision: Decision, interval: tuple[float, float], margi
 
 def _more(pairs: Pairs, comparisons: int, margin: float, power: float) -> int | None:
     """How many more instances would tell, if the difference stays what it is: rounded up to two digits."""
-    difference, discordance = float(pairs.differences().mean()), _discordance(pairs)
-    distances = [distance for distance in (abs(difference), difference + margin) if distance > 1e-9]
-    if not distances:
+    needed = _needed(pairs, ERROR / comparisons, margin, power)
+    if not math.isfinite(needed):
         return None
-    needed = min(discordance.instances(min(distance, 1.0), power, ERROR / comparisons) for distance in distances)
-    more = max(needed, FEWEST) - len(pairs.keys)
+    more = math.ceil(max(needed, FEWEST)) - len(pairs.keys)
     unit: int = 10 ** max(int(math.log10(max(more, 1))) - 1, 0)
     return max(math.ceil(more / unit) * unit, 1)
+
+
+def _needed(pairs: Pairs, error: float, margin: float, power: float) -> float:
+    """Instances that would tell, if the difference stays what it is; infinite if none would."""
+    differences = pairs.differences()
+    if pairs.looks is not None:
+        sides = ((differences, 0.0), (-differences, 0.0), (differences, -min(margin, 0.99)))
+        return min(pairs_to_tell(values, below, error / 2.0) for values, below in sides)
+    difference, discordance = float(differences.mean()), _discordance(pairs)
+    distances = [distance for distance in (abs(difference), difference + margin) if distance > 1e-9]
+    return min((discordance.instances(min(distance, 1.0), power, error) for distance in distances), default=math.inf)
+
+
+def _bounds(pairs: Pairs, error: float) -> Interval:
+    """Of the difference of success; where a log was stopped by what it showed, such that hold at every look."""
+    if pairs.looks is None:
+        return success_interval(pairs.differences(), 1.0 - error, pairs.repeats)
+    return anytime_bounds(pairs.differences()[list(pairs.looks.order)], pairs.looks.ends, error / 2.0)[-1]
+
+
+def _method(pairs: Pairs, whole: bool) -> str:
+    if pairs.looks is not None:
+        return "bets on the difference, at any time"
+    return "exact McNemar, mid-p" if whole else "sign flips of the instances' differences, mid-p"
 
 
 def _discordance(pairs: Pairs) -> Discordance:
@@ -204,7 +225,9 @@ def _discordance(pairs: Pairs) -> Discordance:
 
 
 def _probability(pairs: Pairs) -> float:
-    return sign_flip_midp(pairs.differences())
+    if pairs.looks is None:
+        return sign_flip_midp(pairs.differences())
+    return anytime_p(pairs.differences()[list(pairs.looks.order)], pairs.looks.ends)
 
 
 def _about(contender: Contender) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Replays of selectors over streams of a log, in processes; the result does not depend on how many."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -42,8 +43,31 @@ class Setup:
 
 
 @dataclass(frozen=True)
+class Part:
+    """Selectors to replay on the streams of all seeds, under each setup.
+
+    Attributes:
+        log: complete instances only (`osel_sim.analysis.streams.complete_instances`).
+        selectors: names, as `osel_sim.selection.registry.make_selector` takes them; `NAME:warm` for one that is shown the `warm_start` first.
+        seeds: of the streams, and of the selectors.
+        decisions: length of a stream; None: all instances.
+    """
+
+    log: LoggedOutcomes
+    setups: Sequence[Setup]
+    selectors: Sequence[str]
+    seeds: Sequence[int]
+    decisions: int | None = None
+
+    @property
+    def total(self) -> int:
+        """How many decisions that makes."""
+        return len(self.setups) * len(self.selectors) * len(self.seeds) * (len(self.log) if self.decisions is None else self.decisions)
+
+
+@dataclass(frozen=True)
 class _Material:
-    """What a worker needs: contexts float32 (N, D), seeds, policies, of each setup its rewards (N, P, R) and its streams, and selectors of others."""
+    """What workers need for a part: contexts float32 (N, D), seeds, policies, and of each setup its rewards (N, P, R) and its streams."""
 
     contexts: NDArray[np.float32]
     seeds: tuple[int, ...]
@@ -51,52 +75,74 @@ class _Material:
     setups: tuple[Setup, ...]
     rewards: tuple[NDArray[np.float64], ...]
     streams: tuple[Streams, ...]
-    factories: Mapping[str, SelectorFactory]
 
 
-_Job = tuple[int, str, int]
-"""Which setup, which selector, which seed (its position)."""
+_Job = tuple[int, int, str, int]
+"""Which part, which of its setups, which selector, which seed (its position)."""
 
 
 def replay(
-    log: LoggedOutcomes,
-    setups: Sequence[Setup],
-    selectors: Sequence[str],
-    seeds: Sequence[int],
-    decisions: int | None = None,
+    parts: Sequence[Part],
     workers: int = 1,
     progress: Callable[[int], Any] | None = None,
     factories: Mapping[str, SelectorFactory] | None = None,
-) -> list[Choices]:
-    """Show the streams of all seeds to every selector, under each setup.
+) -> Iterator[list[Choices]]:
+    """Replay parts in turn, with one set of workers: while the end of one is waited for, the next is begun.
 
     Args:
-        log: complete instances only (`osel_sim.analysis.streams.complete_instances`).
-        selectors: names, as `osel_sim.selection.registry.make_selector` takes them; `NAME:warm` for one that is shown the `warm_start` first.
-        seeds: of the streams, and of the selectors.
-        decisions: length of a stream; None: all instances.
         workers: processes; with 1 it happens in this one.
         progress: called with a number of decisions made; with 0 when the first worker begins.
         factories: selector -> what makes it, where it is none of the registry's.
 
+    Yields:
+        of each part, as soon as it is complete: the choices under each of its setups.
+
     Raises:
-        UsageError: a selector is to start warm and there is nothing to show it.
+        UsageError: a selector is to start warm and there is nothing to show it, or a stream is to be longer than the log.
     """
-    warm = [name for name in selectors if name.endswith(WARM)]
-    if warm and any(setup.warm_start is None for setup in setups):
-        raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to start warm with")
-    tables = tuple(log.rewards(setup.weights) for setup in setups)
-    streams = tuple(draw_streams(table, seeds, decisions) for table in tables)
-    material = _Material(log.contexts, tuple(seeds), log.policies, tuple(setups), tables, streams, factories or {})
-    jobs = [(at, name, number) for name in sorted(selectors, key=_slowness) for at in range(len(setups)) for number in range(len(seeds))]
-    chosen = [{name: np.zeros(own.order.shape, np.int16) for name in selectors} for own in streams]
-    if {"ppo", "ppo_tuned"} & set(selectors):
+    for part in parts:
+        warm = [name for name in part.selectors if name.endswith(WARM)]
+        if warm and any(setup.warm_start is None for setup in part.setups):
+            raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to start warm with")
+    materials = [_material(part) for part in parts]
+    if any({"ppo", "ppo_tuned"} & set(part.selectors) for part in parts):
         prepare()  # here, once, rather than in every worker
-    count = progress or (lambda decisions: None)
-    for (at, name, number), columns in _run(material, jobs, workers, lambda: count(0)):
-        chosen[at][name][number] = columns
-        count(len(columns))
-    return [Choices(log.keys, log.policies, own.order, own.repeats, names) for own, names in zip(streams, chosen, strict=True)]
+    return _collected(parts, materials, workers, progress or (lambda decisions: None), factories or {})
+
+
+def _material(part: Part) -> _Material:
+    tables = tuple(part.log.rewards(setup.weights) for setup in part.setups)
+    streams = tuple(draw_streams(table, part.seeds, part.decisions) for table in tables)
+    return _Material(part.log.contexts, tuple(part.seeds), part.log.policies, tuple(part.setups), tables, streams)
+
+
+def _collected(
+    parts: Sequence[Part], materials: Sequence[_Material], workers: int, count: Callable[[int], Any], factories: Mapping[str, SelectorFactory]
+) -> Iterator[list[Choices]]:
+    """Put what comes of the jobs together, part by part."""
+    jobs: list[_Job] = [
+        (number, at, name, seed)
+        for number, part in enumerate(parts)
+        for name in sorted(part.selectors, key=_slowness)
+        for at in range(len(part.setups))
+        for seed in range(len(part.seeds))
+    ]
+    chosen = [
+        [{name: np.zeros(own.order.shape, np.int16) for name in part.selectors} for own in material.streams]
+        for part, material in zip(parts, materials, strict=True)
+    ]
+    missing = Counter(number for number, *_ in jobs)
+    with closing(_run(materials, factories, jobs, workers, lambda: count(0))) as results:
+        for number, part in enumerate(parts):
+            while missing[number]:
+                (of, at, name, seed), columns = next(results)
+                chosen[of][at][name][seed] = columns
+                missing[of] -= 1
+                count(len(columns))
+            yield [
+                Choices(part.log.keys, part.log.policies, own.order, own.repeats, names)
+                for own, names in zip(materials[number].streams, chosen[number], strict=True)
+            ]
 
 
 def replay_one(
@@ -143,34 +189,38 @@ def _slowness(name: str) -> int:
     return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
 
 
-def _run(material: _Material, jobs: Sequence[_Job], workers: int, ready: Callable[[], None]) -> Iterator[tuple[_Job, NDArray[np.int16]]]:
+def _run(
+    materials: Sequence[_Material], factories: Mapping[str, SelectorFactory], jobs: Sequence[_Job], workers: int, ready: Callable[[], None]
+) -> Generator[tuple[_Job, NDArray[np.int16]]]:
     if workers == 1:
         ready()
-        with _one_thread():
-            for job in jobs:
-                yield _replay_job(material, job)
+        for job in jobs:
+            with _one_thread():  # not around all of them: what is made of a part in between is not part of it
+                result = _replay_job(materials, factories, job)
+            yield result
         return
-    with closing(run_jobs(partial(_replayer, material), jobs, workers, ready=ready)) as events:
+    with closing(run_jobs(partial(_replayer, materials, factories), jobs, workers, ready=ready)) as events:
         for event in events:
             if isinstance(event, Lost):
                 raise event.error or WorkerError(f"a worker process of the replay died twice ({event.cause}; out of memory?); try --workers 1")
             yield event.value
 
 
-def _replayer(material: _Material) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
+def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
     """What a worker does."""
     _limit_threads()
-    return lambda job, _: [_replay_job(material, job)]
+    return lambda job, _: [_replay_job(materials, factories, job)]
 
 
-def _replay_job(material: _Material, job: _Job) -> tuple[_Job, NDArray[np.int16]]:
-    at, name, number = job
+def _replay_job(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory], job: _Job) -> tuple[_Job, NDArray[np.int16]]:
+    part, at, name, number = job
+    material = materials[part]
     setup, streams = material.setups[at], material.streams[at]
     rewards = streams.rewards(material.rewards[at], number)
     contexts = material.contexts[streams.order[number]]
     contexts.flags.writeable = False
     kind, shown = name.removesuffix(WARM), setup.warm_start if name.endswith(WARM) else None
-    seed, factory = material.seeds[number], material.factories.get(name)
+    seed, factory = material.seeds[number], factories.get(name)
     return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, **setup.settings.get(name, {}))
 
 

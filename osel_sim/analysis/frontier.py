@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.clusters import find_clusters, score_of
 from osel_sim.analysis.cross_fit import best_of_group, cross_fit
-from osel_sim.analysis.engine import Setup, replay
+from osel_sim.analysis.engine import Part, Setup
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.weights_map import Axis, limits, moved, swept
+from osel_sim.formats.replay_result import Choices
 from osel_sim.selection.reward import RewardWeights
 
 _POINTS = 49
@@ -49,7 +50,7 @@ def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWei
     """Frontiers of the hindsight oracle and of the best policy of each cluster.
 
     The cluster's policy is chosen on the half of the instances that the one at hand is not in; what it comes to is then what one could have had. It
-    stands for a selector that has learnt all that the clusters tell. Selectors that learn are replayed at each weight (`selector_frontiers`).
+    stands for a selector that has learnt all that the clusters tell. Selectors that learn are replayed at each weight (`plan_frontiers`).
 
     Args:
         labels: (N,) cluster of each instance.
@@ -73,64 +74,79 @@ def frontiers(log: LoggedOutcomes, labels: NDArray[np.int64], weights: RewardWei
     return found
 
 
-def selector_frontiers(
+@dataclass(frozen=True)
+class FrontierPlan:
+    """What to replay for the frontiers of selectors that learn, and what to make of it.
+
+    Attributes:
+        part: each of a few weights is a setup of it, those of one axis after those of the other.
+        values: axis -> its weights, from 0.
+        labels: (N,) cluster of each of the part's instances.
+        tables: as `measured` gives them.
+    """
+
+    part: Part
+    values: dict[Axis, Array]
+    labels: NDArray[np.int64]
+    tables: dict[str, Array]
+
+    def frontiers(self, choices: Sequence[Choices]) -> dict[str, Any]:
+        """Means over the last quarter of the streams.
+
+        A few streams end in other instances than the log is made of, and long tasks among them would move a whole line. So every cluster counts by
+        its share of the log (post-stratification), which takes three quarters of that away from the seconds of auto on the shipped log.
+
+        Args:
+            choices: what came of `part`.
+
+        Returns:
+            seeds, decisions, and of each weight that can be moved: weights [K] from 0, selectors {name: means as `measured` names them}, [K] each,
+            None where unknown.
+        """
+        length = choices[0].order.shape[1] if choices else 0
+        late, left = slice(length * 3 // 4, None), iter(choices)
+        found: dict[str, Any] = {"seeds": len(self.part.seeds), "decisions": self.part.decisions}
+        for axis, values in self.values.items():
+            own = [next(left) for _ in values]
+            found[axis] = {
+                "weights": values.tolist(),
+                "selectors": {
+                    selector: {
+                        name: [_known(_weighted(one.received(selector, table)[:, late], self.labels[one.order[:, late]], self.labels)) for one in own]
+                        for name, table in self.tables.items()
+                    }
+                    for selector in self.part.selectors
+                },
+            }
+        return found
+
+
+def plan_frontiers(
     log: LoggedOutcomes,
     setup: Callable[[RewardWeights], Setup],
     weights: RewardWeights,
     selectors: Sequence[str],
     seeds: int,
     decisions: int | None,
-    workers: int,
-    progress: Callable[[int, int], Any],
-) -> dict[str, Any]:
-    """Frontiers of selectors that learn, replayed anew at each of a few weights: means over the last quarter of their streams.
-
-    A few streams end in other instances than the log is made of, and long tasks among them would move a whole line. So every cluster counts by its
-    share of the log (post-stratification), which takes three quarters of that away from the seconds of auto on the shipped log.
+) -> FrontierPlan:
+    """Plan to replay selectors anew at each of a few weights.
 
     Args:
         log: complete instances only.
         setup: under what to replay at other weights.
         weights: in the middle.
         seeds, decisions: of the replay that this goes with; one in twenty of the seeds and 1,000 decisions at most are replayed at each weight.
-        progress: called with a number of decisions made, and that of all there will be.
-
-    Returns:
-        seeds, decisions, and of each weight that can be moved: weights [K] from 0, selectors {name: means as `measured` names them}, [K] each, None
-        where unknown.
 
     Raises:
         DataError: there are too few instances for clusters, which say up to where to look.
     """
     labels, rows = find_clusters(log.contexts).labels, swept(log, weights).rows
-    ends, part, labels = limits(log, labels, weights), log.take(rows), labels[rows]
-    streams = range(max(1, seeds // _SEEDS_FOR_EACH))
+    ends, part = limits(log, labels, weights), log.take(rows)
+    values = {axis: np.concatenate([[0.0], np.geomspace(high / 300, high, _REPLAYED - 1)]) for axis, high in ends.items()}
+    setups = [setup(moved(weights, axis, float(value))) for axis in values for value in values[axis]]
     length = min(len(part), _DECISIONS, decisions or _DECISIONS)
-    late = slice(length * 3 // 4, None)
-    tables = measured(part, weights)
-    found: dict[str, Any] = {"seeds": len(streams), "decisions": length}
-    total, made = len(ends) * _REPLAYED * len(selectors) * len(streams) * length, 0
-
-    def count(number: int) -> None:
-        nonlocal made
-        made += number
-        progress(made, total)
-
-    for axis, high in ends.items():
-        values = np.concatenate([[0.0], np.geomspace(high / 300, high, _REPLAYED - 1)])
-        setups = [setup(moved(weights, axis, float(value))) for value in values]
-        choices = replay(part, setups, selectors, streams, length, workers, count)
-        found[axis] = {
-            "weights": values.tolist(),
-            "selectors": {
-                selector: {
-                    name: [_known(_weighted(own.received(selector, table)[:, late], labels[own.order[:, late]], labels)) for own in choices]
-                    for name, table in tables.items()
-                }
-                for selector in selectors
-            },
-        }
-    return found
+    streams = range(max(1, seeds // _SEEDS_FOR_EACH))
+    return FrontierPlan(Part(part, setups, selectors, streams, length), values, labels[rows], measured(part, weights))
 
 
 def _mean(values: Array) -> float:

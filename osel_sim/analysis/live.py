@@ -22,7 +22,7 @@ from osel_sim.formats.values import COUNT, NAME, TEXT
 from osel_sim.interface.outcome import Outcome
 from osel_sim.selection.reward import RewardWeights, check_reward, weights_from
 
-ABOUT = ("task", "seed", "level", "axes", "split", "instruction", "phrasing", "target", "container", "robot")
+ABOUT = ("task", "seed", "level", "axes", "split", "instruction", "phrasing", "target", "container", "robot", "scene")
 """What a decision says of its instance."""
 
 

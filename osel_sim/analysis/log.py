@@ -36,6 +36,7 @@ class LoggedInstance:
 
     Attributes:
         robot: None where all of the log are the usual one's, or there is none.
+        scene: digest of how the scene was set up; None where nobody told.
     """
 
     key: str
@@ -48,6 +49,7 @@ class LoggedInstance:
     level: int | None = None
     split: str | None = None
     robot: str | None = None
+    scene: str | None = None
 
     @property
     def half(self) -> Half:
@@ -264,7 +266,8 @@ def _logged(
     folder: Path, rows: Sequence[Row], metadata: dict[str, Any], encoder: str, contexts: NDArray[np.float32], skills: Skills | None
 ) -> LoggedOutcomes:
     """Rows as arrays, instances in the order in which they first appear; `contexts` are in that order."""
-    instances = {row.instance: _instance(row) for row in reversed(rows)}
+    scenes = {row.instance: row.scene for row in reversed(rows) if row.scene is not None}
+    instances = {row.instance: replace(_instance(row), scene=scenes.get(row.instance)) for row in reversed(rows)}
     keys = tuple(dict.fromkeys(row.instance for row in rows))
     named = metadata.get("policies")
     policies = tuple(dict.fromkeys([*(named if isinstance(named, list) else []), *(row.policy for row in rows)]))

@@ -1,6 +1,6 @@
 """Policies side by side on the same instances: what each came to where both have a valid outcome, and what has no counterpart."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +9,7 @@ import numpy as np
 
 from osel_sim.analysis.live import is_live_run, read_live
 from osel_sim.analysis.log import Array, LoggedInstance, LoggedOutcomes, mean_over_repeats, read_outcomes
+from osel_sim.analysis.until_decided import looks_of
 from osel_sim.core.errors import DataError
 from osel_sim.formats.toml_types import quoted
 from osel_sim.interface.robot import DEFAULT_ROBOT
@@ -44,6 +45,19 @@ class Contender:
 
 
 @dataclass(frozen=True)
+class Looks:
+    """When a log that was recorded until it was decided was looked at.
+
+    Attributes:
+        order: (n,) rows of the pairs as they came.
+        ends: (looks,) how many pairs there were at each.
+    """
+
+    order: tuple[int, ...]
+    ends: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class Pairs:
     """Two contenders on the n instances on which both have a valid outcome.
 
@@ -54,6 +68,8 @@ class Pairs:
         only_first, only_second: instances on which only that one has a valid outcome.
         errors: episodes of either that ended in error, on whatever instance.
         missing: measure -> why there is none.
+        scenes: pairs of which both logs tell that the scene is the same; of the others only the keys say so.
+        looks: where one of the logs was recorded until it was decided; None: the number of instances was fixed.
     """
 
     first: Contender
@@ -67,6 +83,8 @@ class Pairs:
     only_second: int
     errors: tuple[int, int]
     missing: Mapping[str, str]
+    scenes: int = 0
+    looks: Looks | None = None
 
     def differences(self, measure: str = "success") -> Array:
         """The second's value minus the first's, (n,); NaN where one is unknown."""
@@ -82,10 +100,10 @@ def pair(first: Contender, second: Contender, weights: RewardWeights) -> Pairs:
     """Pair two contenders by the instances' keys.
 
     Raises:
-        DataError: no instance has a valid outcome of both, or the logs tell different things of an instance, its task file or the noise.
+        DataError: no instance has a valid outcome of both, or the logs tell different things of an instance, its scene, its task file or the noise.
     """
     if first.log is not second.log:
-        _check_same_conditions(first.log, second.log)
+        check_same_conditions((first.log.source, first.log.metadata), (second.log.source, second.log.metadata))
     (values_first, missing_first), (values_second, missing_second) = first.values(weights), second.values(weights)
     values = values_first, values_second
     at = [
@@ -102,6 +120,7 @@ def pair(first: Contender, second: Contender, weights: RewardWeights) -> Pairs:
     if first.log is not second.log:
         for key, one, other in zip(keys, *rows, strict=True):
             _check_same_instance(key, (first.log, one), (second.log, other))
+        _check_same_scenes(first.log, second.log, rows)
     counts = [np.isfinite(one.log.only([one.policy]).success[own, 0]).sum(axis=1) for one, own in zip((first, second), rows, strict=True)]
     known = [name for name in MEASURES if all(name in own for own in values)]
     return Pairs(
@@ -116,6 +135,8 @@ def pair(first: Contender, second: Contender, weights: RewardWeights) -> Pairs:
         len(at[1]) - len(keys),
         (_errors(first), _errors(second)),
         missing_first | missing_second,
+        sum(None not in scenes for scenes in _scenes(first.log, second.log, rows)),
+        _looks([first.log, second.log], rows),
     )
 
 
@@ -127,15 +148,20 @@ def _some(contender: Contender, keys: Mapping[str, int]) -> str:
     return f"{contender.name} has {len(keys)}" + (f", such as {quoted(next(iter(keys)))}" if keys else "")
 
 
-def _check_same_conditions(one: LoggedOutcomes, other: LoggedOutcomes) -> None:
-    """Refuse logs whose scenes or actions were made differently, as far as their metadata say."""
-    contents = [log.metadata.get("content") or {} for log in (one, other)]
+def check_same_conditions(one: tuple[Path, Mapping[str, Any]], other: tuple[Path, Mapping[str, Any]]) -> None:
+    """Refuse logs, each its folder and metadata, whose scenes or actions were made differently, as far as the metadata say.
+
+    Raises:
+        DataError: naming what differs.
+    """
+    (here, _), (there, _) = one, other
+    contents = [metadata.get("content") or {} for _, metadata in (one, other)]
     for name in sorted(set(contents[0]) & set(contents[1])):
         if name.startswith("task ") and contents[0][name] != contents[1][name]:
-            raise DataError(f"{name} is another file in {other.source} than in {one.source}: scenes of one seed may differ, so they are no pairs")
-    noises = [log.metadata.get("action_noise") for log in (one, other)]
+            raise DataError(f"{name} is another file in {there} than in {here}: scenes of one seed may differ, so they are no pairs")
+    noises = [metadata.get("action_noise") for _, metadata in (one, other)]
     if None not in noises and noises[0] != noises[1]:
-        raise DataError(f"action_noise is {noises[0]} in {one.source} and {noises[1]} in {other.source}: record both with the same --action-noise")
+        raise DataError(f"action_noise is {noises[0]} in {here} and {noises[1]} in {there}: record both with the same --action-noise")
 
 
 def _check_same_instance(key: str, one: tuple[LoggedOutcomes, int], other: tuple[LoggedOutcomes, int]) -> None:
@@ -146,6 +172,38 @@ def _check_same_instance(key: str, one: tuple[LoggedOutcomes, int], other: tuple
         if was is not None and now is not None and was != now:
             there_is, here_is = (f"{quoted(value)} in {log.source}" for value, (log, _) in ((now, other), (was, one)))
             raise DataError(f"instance {quoted(key)} is not the same in both logs: its {name} is {here_is}, {there_is}")
+
+
+def _looks(logs: Sequence[LoggedOutcomes], rows: Sequence[Sequence[int]]) -> Looks | None:
+    """When the pairs were looked at, if one of the logs was stopped by what it showed; of two such, as the second was."""
+    told = [(log, own, found) for log, own in zip(logs, rows, strict=True) if (found := looks_of(log.metadata, str(log.source))) is not None]
+    if not told:
+        return None
+    log, own, (start, every) = told[-1]
+    seeds = [log.instances[row].seed for row in own]
+    if any(seed is None or seed < start for seed in seeds):
+        raise DataError(f"{log.source}: its metadata say that it was recorded until it was decided, but some of its instances have other seeds")
+    rounds = np.array([((seed or 0) - start) // every for seed in seeds])
+    order = np.argsort(rounds, kind="stable")
+    ends = np.searchsorted(rounds[order], np.arange(int(rounds.max()) + 1), side="right")
+    return Looks(tuple(order.tolist()), tuple(ends.tolist()))
+
+
+def _scenes(one: LoggedOutcomes, other: LoggedOutcomes, rows: Sequence[Sequence[int]]) -> list[tuple[str | None, str | None]]:
+    """What both logs tell of the scene of each pair."""
+    return [(one.instances[here].scene, other.instances[there].scene) for here, there in zip(*rows, strict=True)]
+
+
+def _check_same_scenes(one: LoggedOutcomes, other: LoggedOutcomes, rows: Sequence[Sequence[int]]) -> None:
+    """Refuse pairs whose scenes were not set up alike."""
+    differ = [row for row, scenes in enumerate(_scenes(one, other, rows)) if None not in scenes and scenes[0] != scenes[1]]
+    if differ:
+        key = one.keys[rows[0][differ[0]]]
+        raise DataError(
+            f"instance {quoted(key)} is not the same scene in {one.source} and in {other.source}"
+            + (f", nor are {len(differ) - 1} others of {len(rows[0])}" if len(differ) > 1 else "")
+            + ": assets, tasks or versions of the simulator differ. Record both with the same installation"
+        )
 
 
 def _told(instance: LoggedInstance, name: str) -> Any:

@@ -1,7 +1,7 @@
 """A comparison: did one policy get worse than another on the same instances?"""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from annotated_types import Ge, Le, MinLen
 from pydantic import BeforeValidator
@@ -36,9 +36,11 @@ class CompareConfig(LoggedRewardSettings):
     power: Annotated[float, Ge(0.5), Le(0.99), MAIN] = 0.8
     """probability with which the instances that are said to be needed tell"""
     out: Annotated[Path | None, OUTPUT] = None
-    """folder for compare.json (default: none is written)"""
+    """folder for compare.json and its page (default: none is written)"""
     overwrite: Annotated[bool, OUTPUT] = False
     """replace a comparison that is in --out"""
+    open: Annotated[bool, OUTPUT] = False
+    """show the page in the browser"""
     markdown: Annotated[Path | None, OUTPUT] = None
     """file for the tables as Markdown, as for a pull request"""
     junit: Annotated[Path | None, OUTPUT] = None
@@ -66,24 +68,56 @@ def compare(*logs: "Path | str | CompareConfig", **values: Any) -> CompareResult
         raise UsageError("--detect is what --plan plans for; add --plan, or leave it out")
     if config.plan and (config.markdown is not None or config.junit is not None):
         raise UsageError("--plan compares nothing, so there is no --markdown or --junit of it")
+    if config.open and (config.out is None or config.plan):
+        raise UsageError("--open shows the page of a comparison, which lies in --out: give that, and leave --plan out")
     if config.out is not None:
         check_compare_folder(config.out, config.overwrite)
     for flag, file in (("--markdown", config.markdown), ("--junit", config.junit)):
         if file is not None:
             check_file(flag, file)
     contenders = _contenders(config)
-    weights, _ = weights_of(config, contenders[0].log.metadata)
+    weights, _ = weights_of(config, contenders[0].log.metadata, _recorded(contenders[0]))
     if config.plan:
         result: dict[str, Any] = {"plan": plan(contenders, weights, config.detect, config.margin, config.power)}
     else:
         result = compared(contenders, weights, config.margin, config.power)
     if config.out is not None:
         write_compare(config.out, result)
+        if not config.plan:
+            _show(config, result)
     if config.markdown is not None:
         write_report("--markdown", config.markdown, markdown(result))
     if config.junit is not None:
         write_report("--junit", config.junit, junit(result))
     return CompareResult(config.out, result)
+
+
+def _show(config: CompareConfig, result: dict[str, Any]) -> None:
+    """Write the page beside `compare.json`, and open it if that was asked for."""
+    from osel_sim.reporting.compare_page import page_of
+    from osel_sim.reporting.page import write_page
+
+    folder = cast(Path, config.out)
+    try:
+        page = write_page(page_of(result, folder), folder)
+    except OSError as error:
+        raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
+    if config.open:
+        import webbrowser
+
+        webbrowser.open(page.resolve().as_uri())
+
+
+def _recorded(first: "Contender") -> dict[str, Any] | None:
+    """Weights that a live run was made with; a rollout log has none."""
+    from dataclasses import asdict
+
+    from osel_sim.analysis.live import is_live_run
+    from osel_sim.formats.run_config import RUN
+    from osel_sim.selection.reward import weights_from
+
+    source = first.log.source
+    return asdict(weights_from(first.log.metadata["reward"], f"{source / RUN}: configuration.reward")) if is_live_run(source) else None
 
 
 def _configuration(logs: "tuple[Path | str | CompareConfig, ...]", values: dict[str, Any]) -> CompareConfig:

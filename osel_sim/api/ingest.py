@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from osel_sim.formats.rollout_log import Row
     from osel_sim.ingestion.columns import Columns
+    from osel_sim.ingestion.paired import Paired
+    from osel_sim.ingestion.records import Record
     from osel_sim.selection.reward import RewardWeights
 
 logger = logging.getLogger(__name__)
@@ -38,6 +40,8 @@ TABLE_FLAGS = (
     "name",
     *VALUES,
 )
+RESULTS_HAVE = ("text", "image", "group", "context", "key", "policy_column", "repeat_column", "duplicates", "propensity", "policies", "error")
+"""Flags that say where a table has what result files have in places of their own."""
 COLUMNS = Group("Columns of the tables, instead of --map (a column's name; numbers hold for every row)", 1)
 DATASET = Group("A LeRobotDataset, with --metric action-mse", 2)
 
@@ -52,6 +56,8 @@ class IngestConfig(TrustSettings):
     """mapping file; it alone says what a table's columns mean, or with action-mse which names and conventions of the datasets are others"""
     files: Annotated[Names | None, MAIN] = None
     """tables: .csv, .tsv, .jsonl, .json or .parquet, or folders of such; * stands for anything, {NAME} makes a column of it"""
+    results: Annotated[Names | None, MAIN] = None
+    """POLICY=FILE for two or more: result files of lerobot-eval (eval_info.json) or vla-eval, whose episodes are paired by task and seed"""
     encoder: Annotated[str | None, MAIN] = None
     """tfidf, sentence:MODEL, MODEL:TAG of open_clip, a folder, or with images also A+tfidf and A+sentence:MODEL; auto for whichever of those at hand
     predicts success best (default: tfidf, and with images osel_small+tfidf)"""
@@ -165,7 +171,7 @@ def ingest(config: IngestConfig | None = None, /, **values: Any) -> IngestResult
         raise SettingError("out", "is missing: give the folder to write to")
     with trusting(config.trust):
         if config.metric == "action-mse":
-            _refuse(config, (*TABLE_FLAGS, "files"), "--metric action-mse")
+            _refuse(config, (*TABLE_FLAGS, "files", "results"), "--metric action-mse")
             return _action_mse(config, config.out)
         _refuse(config, ("dataset", "policies_dir", "camera", "frames", "tolerance"), "a table; add --metric action-mse for a LeRobotDataset")
         return _table(config, config.out)
@@ -194,8 +200,11 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.selection.reward import RewardWeights
 
     start = time.perf_counter()
-    columns = _columns(config, out)
-    records = read_tables(columns)
+    if config.results is not None:
+        columns, records, found = _results(config, out)
+    else:
+        columns, found = _columns(config, out), None
+        records = read_tables(columns)
     converted = convert(columns, records)
     instances = []
     for source in converted.sources:
@@ -212,18 +221,19 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     inputs = check_out(out, instances)
     keys = [(source.task, source.key.removeprefix(f"{source.task}/")) for source in converted.sources]
     doubts = [*alike("groups", ((task,) for task, _ in keys)), *(alike("instances", keys) if columns.key else ())]
-    for doubt in (*doubts, *beyond_reason(converted.rows, columns.from_flags)):
+    for doubt in (*(found.doubts if found else ()), *doubts, *beyond_reason(converted.rows, columns.from_flags)):
         logger.warning(doubt)
-    notes = [f"{len(records)} rows: {len(instances)} instances, {len(converted.policies)} policies, {len(converted.rows)} outcomes"]
+    notes = [found.note] if found else []
+    notes.append(f"{len(records)} rows: {len(instances)} instances, {len(converted.policies)} policies, {len(converted.rows)} outcomes")
     if converted.dropped:
         notes.append(f"{converted.dropped} duplicate rows left out, {converted.differing or 'none'} of which differed from the row that was kept")
     before = f"{DEFAULT_ENCODER}+" if columns.images else ""
     names = [before + text for text in text_encoders_at_hand()] if config.encoder == AUTO else [config.encoder or before + TFIDF]
-    files = sorted({record.file for record in records})
+    sources = dict(found.files) if found else {file.name: file for file in {record.file for record in records}}
     metadata: dict[str, Any] = {
         "task": columns.name,
         "policies": converted.policies,
-        "source": {"metric": "table", "files": {file.name: file_digest(file) for file in files}},
+        "source": {"metric": "table", "files": {name: file_digest(sources[name]) for name in sorted(sources)}},
     }
     if converted.propensities is not None:
         metadata[PROPENSITIES] = converted.propensities
@@ -294,6 +304,31 @@ def _columns(config: IngestConfig, out: Path) -> "Columns":
         if getattr(config, name) is None:
             raise SettingError(name, "is missing; python -m osel_sim.ingest --help shows examples")
     return parse_columns(as_data(config, files, first_columns(Path(), files) if scaled(config) else ()), COMMAND_LINE, Path())
+
+
+def _results(config: IngestConfig, out: Path) -> "tuple[Columns, list[Record], Paired]":
+    """Result files as a long table: what its columns mean, its rows, and how they were paired."""
+    from osel_sim.core.errors import DataError, did_you_mean
+    from osel_sim.ingestion.columns import COMMAND_LINE, flag
+    from osel_sim.ingestion.columns_file import parse_columns
+    from osel_sim.ingestion.flags import as_data
+    from osel_sim.ingestion.paired import COLUMNS, read_results
+    from osel_sim.ingestion.records import listed
+
+    _refuse(config, ("map", "files", *RESULTS_HAVE), "--results, which says it itself")
+    found = read_results(config.results or ())
+    there = [*found.measured, *COLUMNS]
+    told = {"text": "instruction", "group": "task", "key": "episode", "policy_column": "policy", "policies": tuple(found.files), "error": ("error",)}
+    if config.success is None:
+        told["success"] = ("success",)
+    if config.steps is None and "steps" in found.measured:
+        told["steps"] = ("steps",)
+    columns = parse_columns(as_data(config.changed(**told), tuple(map(str, found.files.values())), there), COMMAND_LINE, Path())
+    for column, key in columns.needed.items():
+        if column not in there:
+            measured = f"{did_you_mean(column, found.measured)}measured in all of them: {listed(sorted(found.measured)) or 'nothing else'}"
+            raise DataError(f"{', '.join(map(str, found.files.values()))}: there is no {column!r}, which {flag(key)} names: {measured}")
+    return columns, found.records, found
 
 
 def _result(config: IngestConfig, out: Path, rows: "list[Row]", encoder: str, start: float, notes: tuple[str, ...] = ()) -> IngestResult:

@@ -3,21 +3,28 @@
 import logging
 import time
 from collections.abc import Mapping, Set
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
+from annotated_types import Ge, Le
+
 from osel_sim.api.results import RecordResult
-from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Index, InstanceSettings, Names, settings
+from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Folder, Group, Index, InstanceSettings, Names, settings
+from osel_sim.api.until_decided import baseline_then, check_flags, concluded, instances_of, read_baseline, said, stopping
 from osel_sim.core.errors import DataError, SettingError
 from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
+    from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.analysis.until_decided import UntilDecided
     from osel_sim.episodes.recording import Recording
     from osel_sim.episodes.workers import Plan
 
 logger = logging.getLogger(__name__)
 
+STOPPING = Group("Stopping early", 0.5)
 _FIXED = {"task": "tasks", "level": "levels", "axis": "axes"} | {name: name for name in ("instances", "start_seed", "action_noise", "split")}
 """Setting -> key in run.json of what a recording keeps from its beginning to its end."""
 
@@ -44,6 +51,14 @@ class RecordConfig(InstanceSettings, ContentSettings):
     """go on with the recording in --out, or add policies, repeats or an encoder's contexts to it"""
     workers: Annotated[Count, MAIN] = 2
     """processes; the result does not depend on how many"""
+    until_decided: Annotated[bool, STOPPING] = False
+    """stop as soon as every two policies are told apart, or the second is no worse than the first by --margin"""
+    margin: Annotated[float, Ge(0.0), Le(0.99), STOPPING] = 0.05
+    """with --until-decided: how much lower success may be to count as no worse; 0.05 is 5 points, 0 asks which is better"""
+    baseline: Annotated[Folder | None, STOPPING] = None
+    """with --until-decided: log to compare with; without --task, its instances are taken"""
+    baseline_policy: Annotated[str | None, STOPPING] = None
+    """policy of --baseline, where that has several (default: the one that is recorded)"""
     start_seed: Annotated[Index, INSTANCES] = 0
     """seed of the first instance"""
 
@@ -62,13 +77,18 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
     given = config.given
     if config.resume and not config.task and config.out is not None:
         config = _as_begun(config, given)
-    if config.out is None:
+    folder = config.out
+    if folder is None:
         raise SettingError("out", "is missing: give the folder to write to")
+    check_flags(config)
+    baseline = read_baseline(config)
+    if baseline is not None and not config.task:
+        config = _of_the_same_instances(config, baseline)
     with trusting(config.trust):
-        return _record(config, config.out, "encoder" in given)
+        return _record(config, folder, baseline, "encoder" in given)
 
 
-def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordResult:
+def _record(config: RecordConfig, folder: Path, baseline: "LoggedOutcomes | None", encoder_given: bool) -> RecordResult:
     from osel_sim.core.holding import held, taken
     from osel_sim.formats.rollout_log import ROLLOUTS
     from osel_sim.formats.run_config import RUN, check_run_folder, read_run
@@ -78,12 +98,17 @@ def _record(config: RecordConfig, folder: Path, encoder_given: bool) -> RecordRe
     plan = _plan(config)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
     before = read_run(folder) if config.resume and (folder / RUN).exists() else None
+    stop = None
+    if config.until_decided:
+        configuration |= said(config, plan, baseline, before and before["configuration"])
+        stop = stopping(plan, configuration, baseline, folder)
     known = configuration if before is None else _as_it_began(configuration, before["configuration"])
     check_run_folder(folder, known, config.resume)
     if before is None:
         check_servers(plan.everyone, plan.tasks[0].specification)
     with held(folder) if before is not None else taken(folder, (SHARDS, ROLLOUTS)):
-        return _record_into(folder, config, plan, configuration, known, before, encoder_given)
+        result = _record_into(folder, config, plan, configuration, known, before, encoder_given, stop)
+    return result if stop is None else concluded(result, plan, configuration, baseline)
 
 
 def _record_into(
@@ -94,12 +119,14 @@ def _record_into(
     known: dict[str, Any],
     before: dict[str, Any] | None,
     encoder_given: bool,
+    stop: "UntilDecided | None",
 ) -> RecordResult:
     """Record what is missing into a folder that this process holds.
 
     Args:
         configuration: as it is asked for now; `known`: as it would have been at the beginning.
         before: the folder's `run.json`, None for a new one.
+        stop: says when it has enough.
     """
     from osel_sim.context.encoder import load_encoder
     from osel_sim.core.files import write_json
@@ -116,13 +143,14 @@ def _record_into(
     for warning in start_or_resume(folder, known, ran_with(plan.tasks), config.resume, config.to_json()):
         logger.warning(warning)
     recording = Recording(folder, plan, encoder.identity, skills)
+    _keep_what_decides(recording, stop)
     if recording.complete:
         logger.info("%s is complete", folder)
         return RecordResult(folder)
     if before is not None:
         write_json(folder / RUN, before | {"settings": config.to_json(), "configuration": configuration})
     try:
-        done, seconds = _record_missing(recording, config.workers) if recording.missing() else (0, 0.0)
+        done, seconds = _record_missing(recording, config.workers, stop) if recording.missing() else (0, 0.0)
     except BaseException:
         if not recording.grew and before is not None:  # nothing came of it, such as for want of a checkpoint: the folder is as it was
             write_json(folder / RUN, before)
@@ -187,29 +215,54 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
 
     folder = cast(Path, config.out)
     check_run_folder(folder, {}, resume=True)
-    began = read_run(folder)["configuration"]
+    run = read_run(folder)
+    began = run["configuration"]
     try:
-        values = {name: began[key] for name, key in _FIXED.items()}
-        values["axis"] = tuple(part for axes in began["axes"] for part in axes.split(","))
+        values = _instances_as(began)
         for name in given & set(_FIXED):
             own = getattr(config, name)
             if (list(own) if isinstance(own, tuple) else own) != began[_FIXED[name]]:
                 words = " ".join(map(str, own)) if isinstance(own, tuple) else own
                 raise SettingError(name, f"{words}, but {folder / RUN} began with {began[_FIXED[name]]}; leave it out, or give another --out")
-        robot = began.get("robot")
+        robot = values["robot"]
         if config.robot not in (None, robot or DEFAULT_ROBOT):
             raise SettingError(
                 "robot", f"{config.robot}, but {folder / RUN} began with {robot or DEFAULT_ROBOT}; leave it out, or give another --out"
             )
-        values["robot"] = robot if isinstance(robot, str) else None
         values["policies"] = tuple(dict.fromkeys([*began["policies"], *(config.policies or ())]))
         values["encoder"] = config.encoder or began["encoder"].partition("@")[0]
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
+        if "until_decided" in began:
+            values |= {"until_decided": True, "baseline": config.baseline or baseline_then(run.get("settings"), folder)}
+            values |= {"baseline_policy": began["until_decided"].get("baseline_policy"), "margin": began["until_decided"]["margin"]}
+            if "margin" in given and config.margin != values["margin"]:
+                raise SettingError("margin", f"{config.margin}, but {folder / RUN} began with {values['margin']}; leave it out")
     except KeyError as missing:
         raise DataError(f"{folder / RUN}: not of a recording by this version, it has no {missing}; give all flags it was made with") from None
     except (TypeError, AttributeError) as error:
         raise DataError(f"{folder / RUN}: configuration does not have the promised form ({error})") from None
     return config.changed(**values)
+
+
+def _instances_as(began: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings of a recording on the same instances; raises KeyError or TypeError where its configuration has another form."""
+    robot = began.get("robot")
+    values = {name: began[key] for name, key in _FIXED.items()}
+    values["axis"] = tuple(part for axes in began["axes"] for part in axes.split(","))
+    return values | {"robot": robot if isinstance(robot, str) else None}
+
+
+def _of_the_same_instances(config: RecordConfig, baseline: "LoggedOutcomes") -> RecordConfig:
+    """The settings with the instances of a baseline's log, and its repeats; those that were given stay."""
+    try:
+        values = _instances_as(baseline.metadata) | {name: baseline.metadata[name] for name in ("repeats", "repeat_every")}
+    except (KeyError, TypeError, AttributeError) as error:
+        raise DataError(
+            f"--baseline {baseline.source} does not say how its instances were drawn ({error}): it is from elsewhere or of an earlier version; "
+            "give --task and the other flags it was recorded with"
+        ) from None
+    values |= instances_of(baseline)
+    return config.changed(**{name: value for name, value in values.items() if name not in config.given})
 
 
 def _as_it_began(configuration: Mapping[str, Any], before: Mapping[str, Any]) -> dict[str, Any]:
@@ -225,34 +278,53 @@ def _as_it_began(configuration: Mapping[str, Any], before: Mapping[str, Any]) ->
         digests = {key: value for key, value in configuration["content"].items() if key in content_then or key.partition(" ")[2] not in added}
         known |= {"policies": policies, "content": digests}
     repeats, every = before.get("repeats", 1), before.get("repeat_every", 1)
+    if "until_decided" in configuration:
+        return known  # more repeats would have decided otherwise
     # More of them: every episode there was is still asked for.
     if configuration["repeats"] >= repeats and (repeats == 1 or every % configuration["repeat_every"] == 0):
         known |= {"repeats": repeats, "repeat_every": every}
     return known
 
 
-def _record_missing(recording: "Recording", workers: int) -> tuple[int, float]:
+def _keep_what_decides(recording: "Recording", stop: "UntilDecided | None") -> bool:
+    """Want no more than what it took to decide, if that is there. Returns whether it is."""
+    if stop is None or not stop.look(recording.rows):
+        return False
+    recording.keep_to(cast("frozenset[str]", stop.kept))
+    return True
+
+
+def _record_missing(recording: "Recording", workers: int, stop: "UntilDecided | None") -> tuple[int, float]:
     """Record what is not there yet, with a progress bar, and add it. Returns how many episodes, and the seconds they took."""
     from osel_sim.core.progress import progress
     from osel_sim.episodes.workers import record as record_episodes
     from osel_sim.interface.outcome import credited
 
     plan, missing = recording.plan, recording.missing()
+    if stop is not None:
+        missing = {key: missing[key] for key in stop.order if key in missing}
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
     unit = "episode" if left else "context"
     logger.info("starting %d workers: they load the encoder%s ...", workers, ", policies and servers" if left else "")
     start = time.perf_counter()
     done, successes = 0, 0.0
-    with progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar:
-        for recorded in record_episodes(plan if left else replace(plan, everyone=()), missing, workers, bar.begin):  # contexts alone need no policy
+    wanted = plan if left else replace(plan, everyone=())  # contexts alone need no policy
+    with (
+        progress(total if left else len(missing), unit, initial=total - left if left else 0) as bar,
+        closing(record_episodes(wanted, missing, workers, bar.begin)) as events,
+    ):
+        for recorded in events:
             if recorded is None:
                 bar.update()
                 continue
             rows = recording.add(recorded)
+            decided = _keep_what_decides(recording, stop)
             if not left:
                 bar.update()
                 continue
             done += len(rows)
             successes += sum(credited(row, "success") for row in rows)
             bar.note(f"success {100 * successes / done:.0f}%, {3600 * done / (time.perf_counter() - start):.0f} episodes/h")
+            if decided and not recording.missing():
+                break  # what workers have made beyond is not part of the log
     return done, time.perf_counter() - start

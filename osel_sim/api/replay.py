@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,6 +14,7 @@ from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 if TYPE_CHECKING:
     from osel_sim.analysis.encoder_choice import EncoderChoice
     from osel_sim.analysis.engine import Setup
+    from osel_sim.analysis.frontier import FrontierPlan
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.analysis.targets import Target
@@ -24,6 +25,9 @@ logger = logging.getLogger(__name__)
 
 COSTS, SKILLS, PARTS = "expected_costs", "skills", "parts"
 """Settings of selectors that are told what policies cost, what they were made for, and what a context consists of, rather than learn it."""
+
+SOONEST = ("auto", "linucb")
+"""Selectors that are replayed first: they take seconds where PPO takes minutes, and the verdict hardly ever changes with the others."""
 
 
 @settings
@@ -46,6 +50,8 @@ class ReplayConfig(LoggedRewardSettings):
     """where to write (default: runs/replay-LOG)"""
     overwrite: Annotated[bool, MAIN] = False
     """replace a replay that is in --out"""
+    open: Annotated[bool, MAIN] = False
+    """write its page too and show it in the browser, as soon as there is a verdict; reload it as more is replayed"""
     workers: Annotated[Count, MAIN] = 2
     """processes; the result does not depend on how many"""
     unknown_costs: Annotated[bool, OTHER] = False
@@ -84,7 +90,8 @@ def replay(
         selectors: names, or classes or functions of one's own: called with the policies' names, the context's length and the seed.
         targets: of a live run, or of logged decisions: tables, or functions by name, of ways of choosing of one's own, whose reward is estimated
             too. A function is called with an instance and its context and returns policy -> probability.
-        on_result: called as soon as the verdict is there, before selectors are replayed at other weights for the frontier.
+        on_result: called whenever more is there and written: with the verdict from `auto` and `linucb`, with that from all selectors, and with the
+            frontier. What is yet to come, `ReplayResult.pending` says.
         values: settings by name, as `ReplayConfig` has them.
 
     Raises:
@@ -144,7 +151,7 @@ class _Replay:
         if live.has_all_outcomes(weights):
             return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
         write_off_policy(folder, found)
-        return self._tell(ReplayResult(folder, off_policy=found))
+        return self._tell(ReplayResult(folder, off_policy=found), config.log, True)
 
     def _replay(
         self,
@@ -155,44 +162,53 @@ class _Replay:
         choice: "EncoderChoice | None" = None,
         off_policy: dict[str, Any] | None = None,
     ) -> ReplayResult:
-        """Replay, write and tell; then at other weights."""
-        from osel_sim.analysis.engine import replay as replay_streams
+        """Replay stage by stage: what a verdict needs, all other selectors, and again at other weights. Each is written and told."""
+        from osel_sim.analysis.engine import Part
+        from osel_sim.analysis.engine import replay as replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import build, tables, with_fixed
         from osel_sim.core.progress import progress
-        from osel_sim.formats.replay_result import write_replay
+        from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
 
-        config = self.config
+        config, seeds = self.config, range(self.config.seeds)
         if config.context:
             log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
         here = setup(weights)
         best = oracles(log, weights)
-        decisions = len(log) if config.decisions is None else config.decisions
-        with progress(len(selectors) * config.seeds * decisions, "decision", scale=True) as bar:
-            (chosen,) = replay_streams(
-                log, [here], selectors, range(config.seeds), config.decisions, config.workers, bar.update, factories=self.factories
-            )
-        choices = with_fixed(chosen, best)
-        result = build(log, weights, preset, choices, best, left_out, range(config.seeds))
-        result["log"] |= {"half": config.half, "context": config.context}
-        result["log"]["encoder_choice"] = None if choice is None else {"text": str(choice), **asdict(choice)}
-        result["off_policy"] = off_policy
-        result |= _told(here)
-        write_replay(config.folder, result, choices, tables(result))
-        replayed = self._tell(ReplayResult(config.folder, result, off_policy))
-        learners = [name for name in selectors if name != "random" and name not in self.factories]
-        frontier = None if config.no_frontier else self._frontier(log, setup, weights, learners)
-        if frontier is None:
-            return replayed
-        result["frontier"] = frontier
-        write_replay(config.folder, result, choices, tables(result))
-        return ReplayResult(config.folder, result, off_policy)
+        plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
+        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
+        parts = [*stages, *([] if plan is None else [plan.part])]
+        done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
+        with progress(sum(part.total for part in parts), "decision", scale=True) as bar:
+            for part, made in zip(parts, replay_parts(parts, config.workers, bar.update, self.factories), strict=True):
+                if plan is not None and part is plan.part:
+                    result["frontier"] = plan.frontiers(made)
+                else:
+                    chosen |= made[0].chosen
+                    known = {name: chosen[name] for name in selectors if name in chosen}
+                    choices = with_fixed(replace(made[0], chosen=known), best)
+                    result = build(log, weights, preset, choices, best, left_out, seeds)
+                    result["log"] |= {"half": config.half, "context": config.context}
+                    result["log"]["encoder_choice"] = None if choice is None else {"text": str(choice), **asdict(choice)}
+                    result["off_policy"] = off_policy
+                    result |= _told(here)
+                pending = [name for name in selectors if name not in chosen]
+                pending += [FRONTIER] if plan is not None and part is not plan.part else []
+                whole = {**result, PENDING: pending} if pending else result
+                with bar.aside():
+                    write_replay(config.folder, whole, choices, tables(result))
+                    done = self._tell(ReplayResult(config.folder, whole, off_policy), config.folder, part is parts[0])
+        return done
 
-    def _tell(self, result: ReplayResult) -> ReplayResult:
+    def _tell(self, result: ReplayResult, page_of: Path, first: bool) -> ReplayResult:
         if self.on_result is not None:
             self.on_result(result)
+        if self.config.open:
+            from osel_sim.api.report import report
+
+            report(page_of, open=first)
         return result
 
     def _instances(self, log: "LoggedOutcomes", weights: "RewardWeights") -> "tuple[LoggedOutcomes, LoggedOutcomes, Any]":
@@ -239,18 +255,16 @@ class _Replay:
 
         return setup
 
-    def _frontier(
-        self, log: "LoggedOutcomes", setup: "Callable[[RewardWeights], Setup]", weights: "RewardWeights", learners: Sequence[str]
-    ) -> dict[str, Any] | None:
-        from osel_sim.analysis.frontier import selector_frontiers
-        from osel_sim.core.progress import progress
+    def _plan_frontier(
+        self, log: "LoggedOutcomes", setup: "Callable[[RewardWeights], Setup]", weights: "RewardWeights", selectors: Sequence[str]
+    ) -> "FrontierPlan | None":
+        from osel_sim.analysis.frontier import plan_frontiers
 
-        config = self.config
+        learners = [name for name in selectors if name != "random" and name not in self.factories]
         if not learners:
             return None
         try:
-            with progress(None, "decision", "at other weights", scale=True) as bar:
-                return selector_frontiers(log, setup, weights, learners, config.seeds, config.decisions, config.workers, bar.at)
+            return plan_frontiers(log, setup, weights, learners, self.config.seeds, self.config.decisions)
         except DataError as error:
             logger.warning("no frontier of selectors: %s", error)
             return None
@@ -268,6 +282,12 @@ class _Replay:
         own = {file.stem: read_target(file, log.keys, log.policies) for file in self.config.targets}
         own |= {name: probabilities_of(name, target, live) for name, target in self.targets.items()}
         return evaluate(live, weights, own)
+
+
+def _stages(selectors: Sequence[str]) -> list[list[str]]:
+    """Those that a verdict comes of soonest, and all others; where there is nothing to tell apart, all in one."""
+    first = [name for name in selectors if name in SOONEST]
+    return [names for names in (first, [name for name in selectors if name not in first]) if names] or [[]]
 
 
 def _told(setup: "Setup") -> dict[str, Any]:

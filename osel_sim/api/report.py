@@ -1,4 +1,4 @@
-"""The page of a live run, a replay or a rollout log."""
+"""The page of a live run, a replay, a comparison or a rollout log."""
 
 import contextlib
 import logging
@@ -22,10 +22,10 @@ logger = logging.getLogger(__name__)
 
 @settings
 class ReportConfig(LoggedRewardSettings):
-    """Write one page about a live run, a replay or a rollout log: verdict, curves, tables, maps, episodes."""
+    """Write one page about a live run, a replay, a comparison or a rollout log: verdict, curves, tables, maps, episodes."""
 
     folder: Folder
-    """folder of a live run, a replay or a rollout log"""
+    """folder of a live run, a replay, a comparison or a rollout log"""
     out: Annotated[Path | None, MAIN] = None
     """where to write (default: into the folder itself)"""
     open: Annotated[bool, MAIN] = False
@@ -58,10 +58,10 @@ class ReportResult:
 
 
 def report(folder: "Path | str | ReportConfig", **values: Any) -> ReportResult:
-    """Write the page of a live run, a replay or a rollout log.
+    """Write the page of a live run, a replay, a comparison or a rollout log.
 
     Args:
-        folder: of a run, a replay or a log; or all settings as one object, of which `values` change some.
+        folder: of a run, a replay, a comparison or a log; or all settings as one object, of which `values` change some.
         values: settings by name, as `ReportConfig` has them.
 
     Raises:
@@ -122,6 +122,7 @@ def _is_finished_log(folder: Path) -> bool:
 
 
 def _page(config: ReportConfig) -> "Page":
+    from osel_sim.formats.compare_result import COMPARE
     from osel_sim.formats.journal import JOURNAL
     from osel_sim.formats.replay_result import REPLAY
     from osel_sim.formats.rollout_log import ROLLOUTS
@@ -151,13 +152,17 @@ def _page(config: ReportConfig) -> "Page":
         return log_page(log, weights, draw, rows)
     for setting in ("encoder", *FLAGS):
         if getattr(config, setting) is not None:
-            raise SettingError(setting, f"{folder} is no rollout log; a run and a replay have what they were made with")
+            raise SettingError(setting, f"{folder} is no rollout log; a run, a replay and a comparison have what they were made with")
     if (folder / REPLAY).is_file():
         from osel_sim.reporting.replay_page import ReplayOptions, replay_page
 
         return replay_page(folder, ReplayOptions(config.log, draw))
+    if (folder / COMPARE).is_file():
+        from osel_sim.reporting.compare_page import compare_page
+
+        return compare_page(folder)
     if (folder / JOURNAL).is_file():
         from osel_sim.reporting.run_page import run_page
 
         return run_page(folder, draw, config.out)
-    raise DataError(f"{folder} holds neither {JOURNAL} (a live run), {REPLAY} (a replay) nor {ROLLOUTS} (a rollout log)")
+    raise DataError(f"{folder} holds neither {JOURNAL} (a live run), {REPLAY} (a replay), {COMPARE} (a comparison) nor {ROLLOUTS} (a rollout log)")

@@ -61,11 +61,23 @@ class RecordResult:
         folder: of the rollout log.
         recorded: how many episodes were run this time.
         seconds: that it took.
+        comparison: of a recording until decided, as `compare` has it; None of others.
+        instances, planned: of a recording until decided, how many instances it took, and how many there might have been.
+        spared: episodes that were planned and not needed.
     """
 
     folder: Path
     recorded: int = 0
     seconds: float = 0.0
+    comparison: Mapping[str, Any] | None = None
+    instances: int = 0
+    planned: int = 0
+    spared: int = 0
+
+    @property
+    def verdict(self) -> str:
+        """Of a recording until decided: which is better? In words; empty of others."""
+        return str(self.comparison["verdict"]["text"]) if self.comparison else ""
 
     @cached_property
     def rows(self) -> "list[Row]":
@@ -93,6 +105,11 @@ class ReplayResult:
     folder: Path
     result: Mapping[str, Any] | None = None
     off_policy: Mapping[str, Any] | None = None
+
+    @property
+    def pending(self) -> list[str]:
+        """What is not replayed yet: names of selectors, and `frontier`."""
+        return list(self.result.get("pending", [])) if self.result else []
 
     @property
     def verdict(self) -> str:
@@ -145,6 +162,13 @@ class CompareResult:
         from osel_sim.formats.compare_result import COMPARE
 
         return None if self.folder is None else self.folder / COMPARE
+
+    @property
+    def page(self) -> Path | None:
+        """The page beside it; None of a plan."""
+        from osel_sim.reporting.page import PAGE
+
+        return None if self.folder is None or "plan" in self.result else self.folder / PAGE
 
     @property
     def decision(self) -> str:

@@ -26,7 +26,7 @@ class Group:
     """
 
     title: str
-    order: int
+    order: float
 
 
 MAIN = Group("What matters most", 0)

@@ -15,10 +15,14 @@ from osel_sim.core.shown import all_shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.robot import DEFAULT_ROBOT
+from osel_sim.interface.suite import OURS
 from osel_sim.selection import registry as selectors
 from osel_sim.selection.weights import PRESETS
 from osel_sim.sim.robots import ROBOTS
 from osel_sim.suites import SUITES
+
+MOST_TASKS = 12
+"""Of so many tasks of a suite of others the terminal shows a table."""
 
 
 def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str, list[dict[str, Any]]]:
@@ -35,7 +39,7 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
         "tasks": [_task(load_task_file(file)) for _, file in sorted(content.files("tasks", tasks).items())],
         "robots": [{"name": name} for name in sorted(ROBOTS.locations())],
         "policies": [_policy(load_policy_file(file)) for _, file in sorted(content.files("policies", policies).items())],
-        "suites": [_suite(name) for name in SUITES.others()],
+        "suites": [_suite(name) for name in SUITES if name != OURS],
         "selectors": [{"name": name, "about": selectors.ABOUT.get(name, f"of another package ({place})")} for name, place in _selectors()],
         "encoders": [{"name": name, "about": about} for name, about in _encoders()],
         "presets": [{"name": name, **asdict(weights)} for name, weights in PRESETS.items()],
@@ -60,6 +64,10 @@ def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Pa
     console().print(f"Robots, for --robot: {', '.join(robot['name'] for robot in found['robots'])}; {DEFAULT_ROBOT} unless a task file names another")
     for suite in found["suites"]:
         table = Table(f"Tasks of {suite['name']}: {suite['title']}", columns)
+        if suite["problem"] is None and not 0 < len(suite["tasks"]) <= MOST_TASKS:
+            about = f"{len(suite['tasks'])} tasks" if suite["tasks"] else "tasks by name"
+            console().print(plain(f"{suite['name']}: {suite['title']}; {about} (python -m osel_sim.suites list --suite {suite['name']})"))
+            continue
         for task in suite["tasks"]:
             table.add(task["name"], task["title"], ", ".join(task["tags"]), str(task["horizon"]))
         console().print(table if suite["problem"] is None else plain(f"{suite['name']}: {suite['problem']}"))

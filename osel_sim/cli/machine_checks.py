@@ -13,7 +13,7 @@ from pathlib import Path
 
 from osel_sim.core import content
 from osel_sim.core.caches import prepare
-from osel_sim.core.errors import ContentError, DataError, DisplayError, OselError, UsageError
+from osel_sim.core.errors import ContentError, DataError, DisplayError, UsageError
 from osel_sim.core.files import read_json
 from osel_sim.core.proxies import settings
 from osel_sim.core.shown import shown
@@ -192,15 +192,18 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
 
 
 def _suites() -> Iterator[Check]:
-    """Suites of others that are installed; nothing of ours needs one."""
-    from osel_sim.suites.registry import load_suite
+    """Suites of others; nothing of ours needs one."""
+    from osel_sim.cli.suites_command import state_words, suite_state
+    from osel_sim.interface.suite import OURS
 
-    for name in SUITES.others():
-        try:
-            suite = load_suite(name)
-            yield Check("suites", name, f"{suite.spec.title}, {len(suite.tasks)} tasks")
-        except OselError as error:
-            yield Check("suites", name, str(error), NOTE)
+    for name in SUITES:
+        if name == OURS:
+            continue
+        state = suite_state(name)
+        about = f"{state['title']}, {len(state['tasks'])} tasks" if state["tasks"] else state["title"]
+        missing = [one["command"] for one in state["environments"] if one["state"] == "missing"]
+        words = state_words(state) if state["problem"] or missing else f"{about}; {state_words(state)}"
+        yield Check("suites", name, words, NOTE if state["problem"] or missing else OK, "; ".join(missing))
 
 
 def _policies(folder: Path | None) -> Iterator[Check]:

@@ -11,7 +11,7 @@ from osel_sim.cli.console import MOST_POLICIES, Table, number, percent, plain
 def print_replay(console: Console, result: Mapping[str, Any]) -> None:
     """Print the selectors from best to worst, the oracles, and the verdict."""
     log, learnable = result["log"], result["learnable_oracle"]["name"]
-    title = f"{_few(log['tasks'])}: {result['decisions']} decisions of {log['instances']} instances, {len(result['seeds'])} seeds"
+    title = f"{_few(log['tasks'], 'tasks')}: {result['decisions']} decisions of {log['instances']} instances, {len(result['seeds'])} seeds"
     headings = ("mean reward [95%]", "success", "seconds", "cents", "gap closed [95%]", "last quarter [95%]", "regret", "ahead at")
     table = Table(title, [""], headings)
     fixed = 0
@@ -64,6 +64,14 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
     console.print(plain(result["verdict"]["text"], "bold"), soft_wrap=True)
 
 
+def print_so_far(console: Console, result: Mapping[str, Any]) -> None:
+    """Print the verdict while not all is replayed yet, what it rests on, and what is to come."""
+    learners = [name for name, entry in result["selectors"].items() if entry["kind"] == "learner"]
+    console.print(plain(f"So far, from {_few(learners, 'selectors')} and the fixed policies:"), soft_wrap=True)
+    console.print(plain(result["verdict"]["text"], "bold"), soft_wrap=True)
+    console.print(plain(f"Still being replayed: {', '.join(result['pending'])}; Ctrl-C keeps what is there"), soft_wrap=True)
+
+
 def _gain(entry: Mapping[str, Any]) -> str:
     ends = entry["gain_ci95"]
     return f"{entry['gain']:+.3f}" + (f" [{ends[0]:+.3f}, {ends[1]:+.3f}]" if ends else "")
@@ -91,8 +99,8 @@ def _estimate(entry: Mapping[str, Any], way: str) -> str:
     return f"{shown} ({entry[f'{way}_effective']:.0f})"
 
 
-def _few(tasks: Sequence[str]) -> str:
-    return ", ".join(tasks[:3]) + (f" and {len(tasks) - 3} more tasks" if len(tasks) > 3 else "")
+def _few(names: Sequence[str], what: str) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more {what}" if len(names) > 3 else "")
 
 
 def _with_interval(value: float, interval: Sequence[float] | None) -> str:

@@ -68,6 +68,10 @@ class RemoteError(OselError):
     """A policy server cannot be started or reached, or broke the protocol."""
 
 
+class SuiteHostError(OselError):
+    """The process that runs a suite's environments cannot be started, has ended, or its simulator failed."""
+
+
 class DataError(OselError):
     """A journal, rollout log or dataset cannot be read or does not have the promised form."""
 

@@ -40,6 +40,14 @@ class Bar:
         """Show a text behind the bar from its next update on."""
         self._bar.set_postfix_str(_line(text), refresh=False)
 
+    @contextmanager
+    def aside(self) -> Iterator[None]:
+        """Take the bar away while the block prints something."""
+        from tqdm.auto import tqdm
+
+        with tqdm.external_write_mode():
+            yield
+
     def close(self) -> None:
         """End the bar; it stays where it is."""
         if self._made is not None:

@@ -17,6 +17,7 @@ _CONTROL = re.compile(
     "\x00-\x08\x0b-\x1f\x7f-\x9f"  # C0 but tab and newline, DEL, C1: what terminals obey
     "\u202a-\u202e\u2066-\u2069"  # embeddings, overrides and isolates, which turn the order of what follows around
     "\u2028\u2029"  # line ends to some, and none to others
+    "\ufffe\uffff"  # no characters: no XML holds them, and a drawing with one ends this process
     "\ud800-\udfff"  # halves of a character, as of file names that are not UTF-8: no output takes them
     "\U000e0000-\U000e007f"  # tags, which nobody sees
     "]"

@@ -90,6 +90,8 @@ class LiveRun:
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
         self._rows: list[list[float]] = []
+        # A journal begun by a version that did not tell scenes stays as it would have been.
+        self._tells_scenes = not self.decisions or self.decisions[0].scene is not None
 
     @property
     def policies(self) -> Sequence[str]:
@@ -153,7 +155,7 @@ class LiveRun:
         for subscriber in self.subscribers:
             subscriber.on_choice(index, choice.policy)
         outcome = self._episode(index, instance, start, choice.policy, chosen=True)
-        decision = self._decision(index, instance, choice, outcome)
+        decision = self._decision(index, instance, choice, outcome, start.scene if self._tells_scenes else None)
         # What a suite or a selector of others got wrong is told now, not when the journal is read.
         to_decision(as_read(decision.to_dict(), f"{self._journal.file}, line {index + 1}"), index, self._journal.file)
         rewards = {choice.policy: decision.reward}
@@ -235,7 +237,7 @@ class LiveRun:
         row = [rewards.get(policy) for policy in self.policies]
         self._rows.append([float("nan") if value is None else value for value in row])
 
-    def _decision(self, index: int, instance: Instance, choice: Choice, outcome: Outcome) -> Decision:
+    def _decision(self, index: int, instance: Instance, choice: Choice, outcome: Outcome, scene: str | None) -> Decision:
         own: dict[str, Any] = {key: value for key, value in vars(outcome).items() if key not in ("fallback", "error")}
         return Decision(
             index=index,
@@ -244,6 +246,7 @@ class LiveRun:
             reward=self._reward(outcome),
             fallback=outcome.fallback,
             error=outcome.error,
+            scene=scene,
             **_about(instance),
             **own,
         )

@@ -18,12 +18,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from osel_sim.core.errors import SuiteHostError
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.call import Call, Caller, Privileged
 from osel_sim.interface.environment import ActionSpec, Environment, TakesChunks
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome, Seconds
-from osel_sim.interface.policy import Actions
+from osel_sim.interface.policy import Actions, Observation
+from osel_sim.policy.history import History
 
 
 @dataclass(frozen=True)
@@ -115,8 +117,9 @@ def run_episode(
             failure = episode.drive(fallback, episode_seed(instance.key, fallback.spec.name, repeat))
         error = None if failure is None else f"{episode.policy}: {failure}"
     except Exception as problem:
-        if episode.telling:
+        if episode.telling and not isinstance(problem, SuiteHostError):  # a simulator that ended may be noticed by a video first
             raise  # a subscriber's trouble (a full disk) is none of the policy's
+        episode.telling = False
         error = f"{episode.policy}: {type(problem).__name__}: {' '.join(str(problem).split())}"
     outcome = episode.outcome(fallback_reason, error)
     for subscriber in subscribers:
@@ -166,12 +169,14 @@ class _Episode:
         self.upload = self.inference = self.download = 0.0
         self.telling = False  # a subscriber has the word
         self.handed_over: int | None = None  # control steps when the fallback took over
+        self.history = History(1)
 
     def drive(self, driver: Driver, seed: tuple[int, ...]) -> str | None:
         """Let one policy act until the episode is over. Returns why a call of it failed, or None."""
         spec = driver.spec
         self.policy = spec.name
         self.tallies.append(_Tally(spec))
+        self.history = History(spec.history)
         if len(self.tallies) == 1:
             frame = self._frame(waiting=False)
             self._tell(lambda subscriber: subscriber.on_start(frame))
@@ -181,7 +186,7 @@ class _Episode:
             driver.caller.bind(self.env)
         driver.caller.reset(self.instance.instruction, seed)
         while not self.env.done:
-            call = driver.caller.call(self.env.observe(spec.cameras, spec.image_size))
+            call = driver.caller.call(self.history.with_present(self._observe()))
             self._count(call)
             made = self._wait(delay_steps(call, spec.is_remote, self.spec.control_hz), rest if finish_chunk else rest[:0])
             if call.actions is None:
@@ -222,13 +227,15 @@ class _Episode:
 
     def _make(self, actions: Actions) -> int:
         """Make the actions (T, D) of the policy until the episode is over. Returns how many were made."""
-        if self.chunked is not None and len(actions) > 1 and not self.env.done:
-            made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions]))
+        unseen = len(actions) - (self.history.length - 1)
+        if self.chunked is not None and unseen > 1 and not self.env.done:
+            made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions[:unseen]]))
             self.tallies[-1].actions += made
-            return made
+            return made if made < unseen or unseen == len(actions) else made + self._make(actions[unseen:])
         for made, action in enumerate(actions):
             if self.env.done:
                 return made
+            self._remember(len(actions) - made)
             self.env.advance(self.noise(action))
             self.tallies[-1].actions += 1
             self._stepped(waiting=False)
@@ -236,14 +243,25 @@ class _Episode:
 
     def _hold(self, steps: int) -> None:
         """Hold still for so many control steps, or until the episode is over."""
-        if self.chunked is not None and steps > 1 and not self.env.done:
-            self.chunked.advance_chunk(np.stack([self.env.hold_action()] * steps))
-            return
-        for _ in range(steps):
+        unseen = steps - (self.history.length - 1)
+        if self.chunked is not None and unseen > 1 and not self.env.done:
+            self.chunked.advance_chunk(np.stack([self.env.hold_action()] * unseen))
+            steps -= unseen
+        for left in range(steps, 0, -1):
             if self.env.done:
                 return
+            self._remember(left)
             self.env.advance(self.env.hold_action())
             self._stepped(waiting=True)
+
+    def _observe(self) -> Observation:
+        """What the driver sees now."""
+        return self.env.observe(self.tallies[-1].spec.cameras, self.tallies[-1].spec.image_size)
+
+    def _remember(self, left: int) -> None:
+        """Keep what is to be seen now, where a call after the `left` control steps to come may ask for it."""
+        if left < self.history.length:
+            self.history.remember(self._observe())
 
     def _stepped(self, waiting: bool) -> None:
         frame = self._frame(waiting)

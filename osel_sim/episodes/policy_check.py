@@ -1,6 +1,6 @@
 """One instance with one policy, looked at closely: what it saw, what it did, how it ended (`python -m osel_sim.doctor --policy FILE`)."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, override
 
@@ -12,18 +12,24 @@ from osel_sim.core.errors import UsageError
 from osel_sim.core.files import finite, write_json
 from osel_sim.episodes.loop import Driver, Frame, Subscriber, run_episode
 from osel_sim.formats import library
+from osel_sim.formats.conventions import STATE_FRAMES, Conventions
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.call import Call, Caller, Privileged
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.policy import Observation
 from osel_sim.interface.suite import Task
-from osel_sim.policy.mapping import state_of, wanted_parts
+from osel_sim.policy.history import History, split
+from osel_sim.policy.mapping import image_of, state_of, state_size, wanted_parts
 
 OTHER_INSTRUCTION = "leave everything as it is"
 SATURATED, STILL, TINY, FAR = 0.999, 1e-4, 0.02, 8.0
 FLAT_IMAGE = 4.0
 """Standard deviation (of 255) below which an image shows nothing."""
+LIBERO_IMAGES = (
+    {"observation/image", "observation/wrist_image"},  # openpi's examples/libero
+    {"observation.images.image", "observation.images.image2"},  # LeRobot's datasets
+)
 PROBLEM, NOTE = "problem", "note"
 
 
@@ -97,7 +103,9 @@ class _OtherInstruction(Subscriber):
         spec, caller = self._driver.spec, self._driver.caller
         if not spec.is_privileged:
             caller.reset(OTHER_INSTRUCTION, (0,))
-            self.answer = caller.call({**frame.env.observe(spec.cameras, spec.image_size), "task": OTHER_INSTRUCTION})
+            self.answer = caller.call(
+                {**History(spec.history).with_present(frame.env.observe(spec.cameras, spec.image_size)), "task": OTHER_INSTRUCTION}
+            )
 
 
 def find_policy(policy: str, folder: Path | None) -> tuple[PolicySpec, Path | None]:
@@ -144,8 +152,9 @@ def check_policy(spec: PolicySpec, task: Task, seed: int, level: int, out: Path,
     report.calls = len(watched.seen)
     report.outcome = asdict(outcome)
     if watched.seen:
-        _inputs(report, spec, environment, watched.seen[0][0])
-        report.pictures = _pictures(spec, [observation for observation, _ in watched.seen], out)
+        seen = [split(observation)[-1] for observation, _ in watched.seen]
+        _inputs(report, spec, environment, seen[0])
+        report.pictures = _pictures(spec, seen, out)
     _actions(report, environment.action, [call.actions for _, call in watched.seen if call.actions is not None], other.answer)
     _end(report, outcome)
     write_json(out / "report.json", finite(asdict(report)))
@@ -154,7 +163,7 @@ def check_policy(spec: PolicySpec, task: Task, seed: int, level: int, out: Path,
 
 def _inputs(report: Report, spec: PolicySpec, environment: EnvironmentSpec, first: Observation) -> None:
     for camera in spec.cameras:
-        image: NDArray[np.uint8] = first[f"observation.images.{camera}"]
+        image = image_of(first, camera, spec.mapping)
         size = " x ".join(map(str, image.shape[:2]))
         report.inputs[spec.mapping.key(camera)] = f"camera {camera}, {size} pixels, brightness {image.mean():.0f} of 255, contrast {image.std():.0f}"
         if image.std() < FLAT_IMAGE:
@@ -164,38 +173,71 @@ def _inputs(report: Report, spec: PolicySpec, environment: EnvironmentSpec, firs
     if spec.mapping.state and environment.state:
         state, parts = state_of(first, spec.mapping, environment), ", ".join(wanted_parts(spec.mapping, environment))
         report.inputs[spec.mapping.state] = f"{parts}: {np.array2string(state, precision=3, suppress_small=True)}"
-        report.findings += [(NOTE, text) for text in _far_off(spec, state)]
+        report.findings += [(NOTE, text) for text in _far_off(spec, environment, first)]
+    report.findings += [(NOTE, text) for text in _as_libero(spec.mapping)]
     report.inputs[spec.mapping.prompt] = repr(report.instruction)
 
 
-def _far_off(spec: PolicySpec, state: NDArray[np.float32]) -> list[str]:
+def _far_off(spec: PolicySpec, environment: EnvironmentSpec, first: Observation) -> list[str]:
     """Numbers of the state that are far from all that a local checkpoint was trained on."""
+    statistics = _trained_on(spec)
+    if statistics is None or len(statistics[0]) != state_size(spec.mapping, environment):
+        return []
+    mean, spread = statistics
+
+    def away(mapping: Conventions) -> NDArray[np.float64]:
+        return np.abs(state_of(first, mapping, environment) - mean) / np.maximum(spread, 1e-6)
+
+    deviations = away(spec.mapping)
+    worst = int(deviations.argmax())
+    if deviations[worst] <= FAR:
+        return []
+    state = state_of(first, spec.mapping, environment)
+    text = (
+        f"number {worst} of the state, {state[worst]:.3f}, is {deviations[worst]:.0f} standard deviations from the mean {mean[worst]:.3f} "
+        "of what the checkpoint was trained on: do [mapping] state_parts and the robot's starting pose agree with it?"
+    )
+    other = next(frame for frame in STATE_FRAMES if frame != spec.mapping.state_frame)
+    if "axis_angle" in environment.state and (nearer := away(replace(spec.mapping, state_frame=other)).max()) < deviations[worst] / 2:
+        text += f' With state_frame = "{other}" no number would be further away than {nearer:.0f}.'
+    return [text]
+
+
+def _trained_on(spec: PolicySpec) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Mean and standard deviation of the states that a local checkpoint was trained on, each (S,)."""
     from safetensors.numpy import load_file
 
     folder = content.resolve_checkpoint(spec.checkpoint) if spec.checkpoint else None
     for file in sorted(folder.glob("policy_preprocessor*normalizer*.safetensors")) if isinstance(folder, Path) else []:
         statistics = load_file(file)
         mean, spread = (statistics.get(f"observation.state.{key}") for key in ("mean", "std"))
-        if mean is not None and spread is not None and mean.shape == state.shape:
-            away = np.abs(state - mean) / np.maximum(spread, 1e-6)
-            worst = int(away.argmax())
-            if away[worst] > FAR:
-                return [
-                    f"number {worst} of the state, {state[worst]:.3f}, is {away[worst]:.0f} standard deviations from the mean {mean[worst]:.3f} "
-                    "of what the checkpoint was trained on: do [mapping] state_parts and the robot's starting pose agree with it?"
-                ]
-    return []
+        if mean is not None and spread is not None and mean.ndim == 1 and mean.shape == spread.shape:
+            return mean.astype(np.float64), spread.astype(np.float64)
+    return None
+
+
+def _as_libero(mapping: Conventions) -> list[str]:
+    """Names of inputs that are LIBERO's, without LIBERO's conventions."""
+    keys = {*mapping.images.values()}
+    if not any(pair <= keys for pair in LIBERO_IMAGES):
+        return []
+    lacking = [f'flip = {{ {camera} = "horizontal" }}' for camera in mapping.images if camera not in mapping.flip]
+    lacking += ['state_frame = "hand"'] if mapping.state and mapping.state_frame != "hand" else []
+    if not lacking:
+        return []
+    named = ", ".join(sorted(keys))
+    return [f"{named} are LIBERO's names, whose images are mirrored and whose state has the hand's orientation: {'; '.join(lacking)}?"]
 
 
 def _pictures(spec: PolicySpec, observations: list[Observation], out: Path) -> list[str]:
-    """Write what the cameras showed at the first, a middle and the last call."""
+    """Write what the policy was shown of each camera at the first, a middle and the last call."""
     import imageio.v3 as imageio
 
     files = []
     for index in sorted({0, len(observations) // 2, len(observations) - 1}):
         for camera in spec.cameras:
             file = out / f"call{index:03d}_{camera}.png"
-            imageio.imwrite(file, observations[index][f"observation.images.{camera}"])
+            imageio.imwrite(file, image_of(observations[index], camera, spec.mapping))
             files.append(str(file))
     return files
 

@@ -1,9 +1,11 @@
 """A recording in its folder: what is there of a plan, what is missing, and how it becomes a rollout log."""
 
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from osel_sim.context.cache import ContextCache
+from osel_sim.core.errors import DataError
 from osel_sim.episodes.workers import Episode, Plan, Recorded, worker_died
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts, write_rollouts
 from osel_sim.formats.shards import SHARDS, Shards
@@ -26,20 +28,33 @@ class Recording:
     def __init__(self, folder: Path, plan: Plan, encoder: str, skills: Skills | None = None) -> None:
         self.folder, self.plan, self.encoder, self.grew = folder, plan, encoder, False
         self._skills = skills
+        self._instances: tuple[str, ...] = tuple(plan.instances)
         self._cache = ContextCache(folder, autosave=0, mend=True)
         self._rows: dict[str, dict[Episode, Row]] = {}
+        self._scenes: dict[str, str] = {}
         there, metadata = read_rollouts(folder) if (folder / ROLLOUTS).exists() else ([], {})
         self._declared, self._default = metadata.get(DECLARED), metadata.get("encoder")
         self._shards = Shards(folder) if (folder / SHARDS).exists() else None
         in_shards = [row for rows in self._shards.rows.values() for row in rows.values()] if self._shards is not None else []
         for row in [*there, *in_shards]:
+            if row.scene is not None:
+                self._scenes.setdefault(row.instance, row.scene)
             if not worker_died(row):
                 self._rows.setdefault(row.instance, {})[row.policy, row.repeat] = row
 
     @property
+    def rows(self) -> Mapping[str, Mapping[Episode, Row]]:
+        """Instance -> its episodes that are there."""
+        return self._rows
+
+    def keep_to(self, instances: Collection[str]) -> None:
+        """Want no more than these instances of the plan; what is there of others does not go into the log."""
+        self._instances = tuple(key for key in self.plan.instances if key in instances)
+
+    @property
     def lost(self) -> list[Row]:
         """Episodes that were lost, and lost again if they were there before, because their worker died."""
-        return [row for rows in self._rows.values() for row in rows.values() if worker_died(row)]
+        return [row for key in self._instances for row in self._rows.get(key, {}).values() if worker_died(row)]
 
     @property
     def complete(self) -> bool:
@@ -49,7 +64,7 @@ class Recording:
     def missing(self) -> dict[str, list[Episode]]:
         """Episodes that are not there, by instance; an instance that lacks only its context has none."""
         result = {}
-        for instance in self.plan.instances:
+        for instance in self._instances:
             there = self._rows.get(instance, {})
             episodes = [episode for episode in self.plan.episodes(instance) if episode not in there]
             if episodes or not self._has_context(instance):
@@ -57,8 +72,18 @@ class Recording:
         return result
 
     def add(self, recorded: Recorded) -> list[Row]:
-        """Take in an instance, and wait until it is on disk. Returns its new rows in the plan's order."""
+        """Take in an instance, and wait until it is on disk. Returns its new rows in the plan's order.
+
+        Raises:
+            DataError: its scene is another one than that of the episodes which are there.
+        """
         rows = [recorded.rows[episode] for episode in self.plan.episodes(recorded.instance) if episode in recorded.rows]
+        for row in rows:
+            if row.scene is not None and row.scene != self._scenes.setdefault(row.instance, row.scene):
+                raise DataError(
+                    f"{self.folder}: instance {row.instance!r} now has another scene than in the episodes that are there: "
+                    "assets, suite or versions have changed since. Record all policies anew in another folder"
+                )
         if self._shards is None:
             self._shards = Shards(self.folder)
         self._shards.add(recorded.instance, rows, self.encoder, recorded.context)
@@ -74,14 +99,15 @@ class Recording:
         """
         shards = self._shards or Shards(self.folder)
         for encoder, contexts in shards.contexts.items():
-            for instance, context in contexts.items():
-                self._cache.put(encoder, instance, context)
+            for instance in self._instances:
+                if instance in contexts:
+                    self._cache.put(encoder, instance, contexts[instance])
         if self._skills is not None:
             for skill, examples in self._skills.examples.items():
                 self._cache.put_examples(self.encoder, skill, list(examples))
             configuration = configuration | {DECLARED: self._able}
         self._cache.save()
-        write_rollouts(self.folder, [self._rows[key][episode] for key in self.plan.instances for episode in self.plan.episodes(key)], configuration)
+        write_rollouts(self.folder, [self._rows[key][episode] for key in self._instances for episode in self.plan.episodes(key)], configuration)
         shards.close(remove=True)
         self._shards = None
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, override
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.core.errors import UsageError
+from osel_sim.core.errors import SuiteHostError, UsageError
 from osel_sim.core.files import atomic
 from osel_sim.episodes.loop import Frame, Subscriber
 from osel_sim.interface.outcome import Outcome
@@ -39,7 +39,8 @@ class Video(Subscriber):
         self._writer: Generator[None, NDArray[np.uint8] | None, None] | None = None
         self._last: Frame | None = None
         self._every, self._fps = 1, float(RATE)
-        self._image: NDArray[np.uint8] = np.zeros((SIZE, SIZE, 3), np.uint8)
+        self._picture: NDArray[np.uint8] = np.zeros((SIZE, SIZE, 3), np.uint8)
+        self._image = self._picture
 
     @override
     def on_start(self, frame: Frame) -> None:
@@ -84,8 +85,12 @@ class Video(Subscriber):
 
     def _show(self, frame: Frame, outcome: Outcome | None = None) -> None:
         self._last = frame
-        picture = frame.env.image(self.camera or frame.env.specification.context_camera, SIZE, SIZE, self.quality)
-        self._image = annotate(picture, frame, outcome)
+        try:
+            self._picture = frame.env.image(self.camera or frame.env.specification.context_camera, SIZE, SIZE, self.quality)
+        except SuiteHostError:
+            if outcome is None:
+                raise
+        self._image = annotate(self._picture, frame, outcome)
         self._send(self._image)
 
     def _send(self, image: NDArray[np.uint8]) -> None:

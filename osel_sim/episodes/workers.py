@@ -6,7 +6,7 @@ worker dies as well, it becomes an error row, and a new worker does the rest of 
 
 import functools
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -90,7 +90,9 @@ class _Job:
         return self.instance
 
 
-def record(plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int, begun: Callable[[], None] = lambda: None) -> Iterator[Recorded | None]:
+def record(
+    plan: Plan, missing: Mapping[str, Sequence[Episode]], workers: int, begun: Callable[[], None] = lambda: None
+) -> Generator[Recorded | None]:
     """Record these episodes, by instance, each instance yielded when all of its are there, in no particular order; None for every episode in between.
 
     Every instance gets its context as well, also one without episodes.
@@ -153,7 +155,7 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
         for policy, repeat in job.episodes[max(0, start - 1) :]:
             begin.again()
             outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat, action_noise=plan.action_noise)
-            yield make_row(instance, policy, repeat, outcome)
+            yield make_row(instance, policy, repeat, outcome, begin.scene)
 
     return work
 
@@ -168,8 +170,8 @@ def error_row(plan: Plan, instance: str, policy: str, repeat: int, error: str) -
     return make_row(plan.instances[instance], policy, repeat, Outcome(False, 0.0, 0, Seconds(), 0, 0, 0.0, error=error))
 
 
-def make_row(instance: Instance, policy: str, repeat: int, outcome: Outcome) -> Row:
-    """One episode as a row of the rollout log."""
+def make_row(instance: Instance, policy: str, repeat: int, outcome: Outcome, scene: str | None = None) -> Row:
+    """One episode as a row of the rollout log; `scene` as `Start` has it."""
     return Row(
         task=instance.task,
         instance=instance.key,
@@ -194,4 +196,5 @@ def make_row(instance: Instance, policy: str, repeat: int, outcome: Outcome) -> 
         axes=instance.axes,
         robot=instance.other_robot,
         fallback_steps=outcome.fallback_steps,
+        scene=scene,
     )

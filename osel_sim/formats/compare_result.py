@@ -4,8 +4,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from osel_sim.core.errors import UsageError
-from osel_sim.core.files import finite, is_partial, write_json, write_text
+from osel_sim.core.errors import DataError, UsageError
+from osel_sim.core.files import finite, is_partial, read_json, write_json, write_text
+from osel_sim.formats.toml_types import quoted
 
 SCHEMA_VERSION = 1
 COMPARE = "compare.json"
@@ -47,6 +48,32 @@ def write_compare(folder: Path, result: Mapping[str, Any]) -> None:
         write_json(folder / COMPARE, finite({"schema_version": SCHEMA_VERSION, **result}))
     except OSError as error:
         raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
+
+
+def read_compare(folder: Path) -> dict[str, Any]:
+    """Read what `write_compare` wrote of a comparison.
+
+    Raises:
+        DataError: missing, a plan, damaged, of another version, or with parts that do not fit together; names the first place that is wrong.
+    """
+    from pydantic import ValidationError
+
+    from osel_sim.formats.compare_schema import Comparison, faults
+
+    file = folder / COMPARE
+    if not file.is_file():
+        raise DataError(f"{file} does not exist; python -m osel_sim.compare LOG LOG --out {folder} writes it")
+    result = read_json(file)
+    version = result.get("schema_version")
+    if type(version) is not int or version != SCHEMA_VERSION:
+        raise DataError(f"{file}: schema_version must be {SCHEMA_VERSION}, got {quoted(version)}")
+    if "plan" in result:
+        raise DataError(f"{file} is a plan, which compares nothing: leave --plan out, and there is something to show")
+    try:
+        Comparison.model_validate(result)
+    except ValidationError as error:
+        raise DataError(f"{file} is damaged: {next(faults(error))}") from None
+    return result
 
 
 def write_report(flag: str, file: Path, text: str) -> None:

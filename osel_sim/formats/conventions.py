@@ -15,6 +15,11 @@ axis-angle, quaternion (x, y, z, w) or roll-pitch-yaw (radians); both finger pos
 GRIPPERS = ("closed_positive", "open_positive", "closed_one", "open_one")
 """What the gripper's number means: 1 closed and -1 open (as robosuite and LIBERO have it), 1 open and -1 closed, 1 closed and 0 open, 1 open and 0
 closed."""
+FLIPS = ("horizontal", "vertical", "both")
+"""How an image is turned over: left and right change places, top and bottom do, or both (half a turn)."""
+STATE_FRAMES = ("grip", "hand")
+"""Whose orientation the state tells: the grip site's, between the fingers; or that of the hand's body, as robosuite's `robot0_eef_quat` and LIBERO
+have it, a quarter of a turn about the approach axis from it."""
 ENVIRONMENT_STATES = ("hashed_text",)
 
 
@@ -32,10 +37,16 @@ class Conventions:
     """Camera here -> key there."""
     blank: Texts = ()
     """Keys of further images that the policy wants and nothing here shows: they are black."""
+    flip: Mapping[str, Annotated[str, OneOf(FLIPS)]] = field(default_factory=dict)
+    """Camera here -> how its image is turned over: the policy learnt from mirrored (`horizontal`) or turned (`vertical`, `both`) images."""
+    resize: Annotated[int, between(16, 1024)] | None = None
+    """Pixels, square, to which images are brought from `image_size`, bilinearly as Pillow does; left out: they stay as they are."""
     state: str = "observation.state"
     """Key of the state; empty: it gets none."""
     state_parts: Texts = ()
     """What the state is put together from, in order; empty: the environment's own parts."""
+    state_frame: Annotated[str, OneOf(STATE_FRAMES)] = "grip"
+    """Whose orientation axis-angle, quaternion and Euler angles of the state are: the grip site's, or the hand's as in robosuite and LIBERO."""
     prompt: str = "task"
     """Key of the instruction."""
     actions: str = "actions"
@@ -57,9 +68,10 @@ class Conventions:
 
     def faults(self, cameras: tuple[str, ...]) -> Faults:
         """What does not fit the cameras of a policy: (keys within the table, problem)."""
-        for camera in self.images:
-            if camera not in cameras:
-                yield ("images", camera), unknown_value(camera, cameras)
+        for table in ("images", "flip"):
+            for camera in getattr(self, table):
+                if camera not in cameras:
+                    yield (table, camera), unknown_value(camera, cameras)
         keys = [*map(self.key, cameras), *self.blank, self.prompt, *([self.state] if self.state else [])]
         for key in dict.fromkeys(keys):
             if keys.count(key) > 1:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic.dataclasses import dataclass
 
-from osel_sim.formats.conventions import GRIPPERS, Conventions
+from osel_sim.formats.conventions import FLIPS, GRIPPERS, STATE_FRAMES, Conventions
 from osel_sim.formats.toml_file import load_toml
 from osel_sim.formats.toml_types import TABLE, Number, OneOf, Text, Version, between
 
@@ -24,10 +24,14 @@ class DatasetMapping:
     """Of the format."""
     images: Mapping[str, Text] = field(default_factory=dict)
     """Camera of the policy files -> column of the dataset."""
+    flip: Mapping[str, Annotated[str, OneOf(FLIPS)]] = field(default_factory=dict)
+    """Camera of the policy files -> how the dataset's images are turned over: LIBERO's are mirrored (`horizontal`)."""
     state: Text = STATE
     """Column of the state."""
     state_columns: Columns = ()
     """Which of its numbers are gripper position, axis-angle and both fingers, in that order, counted from 0; empty: it has just those."""
+    state_frame: Annotated[str, OneOf(STATE_FRAMES)] = "grip"
+    """Whose orientation the state has: the grip site's, or the hand's as in robosuite and LIBERO."""
     action: Text = ACTION
     """Column of the actions."""
     columns: Columns = ()

@@ -26,6 +26,8 @@ JOURNAL, TIMING = "episodes.jsonl", "timing.jsonl"
 LOST = "the journal lost decisions; put it back, or give another folder with --out"
 """What a journal is told that is shorter than what lies beside it."""
 
+OPTIONAL = ("robot", "fallback_steps", "scene")
+"""Fields of a decision that are not written down where they are None."""
 SEEDS_PER_RUN = 1_000_000
 """Decision t of run seed s is made on the instance of seed s * 1,000,000 + t: no two runs share an instance."""
 
@@ -39,6 +41,7 @@ class Decision:
         propensities: probability of each policy when this one was chosen.
         reward: None when the outcome is an error; nothing is learnt from it then.
         robot: the robot's name, None for the usual one: then it is not written down, as `fallback_steps` is not where no fallback took over.
+        scene: digest of how the scene was set up, with the instruction; not written down where nobody told.
         Others: of the instance and of `Outcome`.
     """
 
@@ -66,11 +69,12 @@ class Decision:
     error: str | None
     robot: str | None = None
     fallback_steps: int | None = None
+    scene: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As the journal has it."""
         data = dataclasses.asdict(self)
-        return {key: value for key, value in data.items() if value is not None or key not in ("robot", "fallback_steps")}
+        return {key: value for key, value in data.items() if value is not None or key not in OPTIONAL}
 
     @property
     def instance(self) -> str:
@@ -190,7 +194,7 @@ def to_decision(data: dict[str, Any], index: int, file: Path) -> Decision:
         DataError: naming file and line.
     """
     place = f"{file}, line {index + 1}"
-    if problem := fault(data, DECISION, optional=("robot", "fallback_steps")):
+    if problem := fault(data, DECISION, optional=OPTIONAL):
         raise DataError(f"{place}: not a decision ({problem})")
     decision = Decision.from_dict(data)
     if decision.index != index:

@@ -74,6 +74,8 @@ class ObservationTable:
     """Different cameras, one or more."""
     image_size: Annotated[int, between(16, 1024)]
     """Pixels of each side: images are square."""
+    history: Annotated[int, between(1, 16)] = 1
+    """How many successive observations it is shown at a call, one control step apart, the newest last."""
 
     @field_validator("cameras")
     @classmethod
@@ -119,6 +121,7 @@ class PolicySpec(_Keys):
 
     Attributes:
         cameras, image_size: what it is shown (square, pixels).
+        history: how many successive observations at a call.
         remote: None for a local policy.
         mapping: the policy's own names and conventions; those of this package where the file has no such table.
     """
@@ -129,6 +132,7 @@ class PolicySpec(_Keys):
     mapping: Conventions = field(default_factory=Conventions)
     file: Path
     version: int = 1
+    history: int = 1
 
     @property
     def is_remote(self) -> bool:
@@ -197,7 +201,15 @@ class PolicyFile(_Keys):
         """The policy as code wants it."""
         same = {key.name: getattr(self, key.name) for key in fields(_Keys)}
         seen = self.observation or ObservationTable(cameras=(), image_size=16)
-        return PolicySpec(**same, cameras=seen.cameras, image_size=seen.image_size, remote=self.remote, mapping=self.mapping, file=file)
+        return PolicySpec(
+            **same,
+            cameras=seen.cameras,
+            image_size=seen.image_size,
+            history=seen.history,
+            remote=self.remote,
+            mapping=self.mapping,
+            file=file,
+        )
 
 
 def load_policy_file(file: Path) -> PolicySpec:

@@ -17,9 +17,12 @@ from osel_sim.core.arrays import read_arrays
 from osel_sim.core.csv_text import to_csv
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_bytes, write_json
+from osel_sim.core.interrupts import uninterrupted
 
 SCHEMA_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
+PENDING, FRONTIER = "pending", "frontier"
+"""Key of `replay.json` while not all is replayed: names of the selectors that are missing, and `frontier` where that is."""
 _PREFIX = "choice."
 
 
@@ -72,7 +75,7 @@ def check_replay_folder(folder: Path, overwrite: bool) -> None:
 
 
 def write_replay(folder: Path, result: Mapping[str, Any], choices: Choices, tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> None:
-    """Write a replay. Each file is written whole or not at all, `replay.json` last.
+    """Write a replay, over one that may be there. Each file is written whole or not at all, `replay.json` last, and Ctrl-C waits until all are.
 
     Args:
         result: what `replay.json` is to hold besides the schema version and the digest; NaN is not allowed, None is null.
@@ -83,17 +86,17 @@ def write_replay(folder: Path, result: Mapping[str, Any], choices: Choices, tabl
         ValueError: NaN or infinity in `result`.
     """
     content = _npz(choices)
-    digest = content_digest(content)
+    result = {"schema_version": SCHEMA_VERSION, **result, "choices_sha256": content_digest(content)}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / REPLAY).unlink(missing_ok=True)
-        write_bytes(folder / CHOICES, content)
-        for name, rows in tables.items():
-            if rows:
-                write_bytes(folder / f"{name}.csv", _csv(rows))
-            else:
-                (folder / f"{name}.csv").unlink(missing_ok=True)
-        write_json(folder / REPLAY, {"schema_version": SCHEMA_VERSION, **result, "choices_sha256": digest})
+        with uninterrupted():
+            for name, rows in tables.items():
+                if rows:
+                    write_bytes(folder / f"{name}.csv", _csv(rows))
+                else:
+                    (folder / f"{name}.csv").unlink(missing_ok=True)
+            write_bytes(folder / CHOICES, content)
+            write_json(folder / REPLAY, result)
     except OSError as error:
         raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
 

@@ -5,8 +5,8 @@ instance, policy, repeat. Logs from elsewhere (osel_sim.ingest) fit the same col
 
 Version 2 of the schema has two columns more. `score`: what was measured where success is a matter of degree, such as minus an action MSE; it is null
 in what this suite records. `axes`: those perturbed beyond `level`, such as `camera=2`. Version 3 has `robot`, and is written only where one is
-not the usual Panda; version 4 `fallback_steps`, only where a fallback took over. Logs of earlier versions are read as before, with what they lack
-null.
+not the usual Panda; version 4 `fallback_steps`, only where a fallback took over; version 5 `scene`, where the suite tells it. Logs of earlier
+versions are read as before, with what they lack null.
 """
 
 import json
@@ -27,8 +27,8 @@ from osel_sim.interface.outcome import Outcome, Seconds
 if TYPE_CHECKING:
     import pyarrow
 
-SCHEMA_VERSION = 4
-_COLUMNS_ADDED = {2: ("score", "axes"), 3: ("robot",), 4: ("fallback_steps",)}
+SCHEMA_VERSION = 5
+_COLUMNS_ADDED = {2: ("score", "axes"), 3: ("robot",), 4: ("fallback_steps",), 5: ("scene",)}
 """Columns that came with a version; logs of an earlier one are read without them."""
 ROLLOUTS = "rollouts.parquet"
 PROPENSITIES = "propensities"
@@ -53,6 +53,7 @@ class Row:
         upload ... motion: seconds, as in `Outcome`.
         score: a graded outcome, higher is better, where there is one; None otherwise. `success` is there all the same, such as "score >= 0.5".
         robot: the robot's name, None for the usual one.
+        scene: digest of how the scene was set up, with the instruction; None where nobody told, or the worker died before.
         Others: as in `Outcome`.
 
     Logs from elsewhere have None where a column makes no sense: no robot, no steps; no price known, no price. Never a made-up number.
@@ -85,6 +86,7 @@ class Row:
     axes: str | None = None
     robot: str | None = None
     fallback_steps: int | None = None
+    scene: str | None = None
 
     @property
     def outcome(self) -> Outcome:
@@ -222,11 +224,13 @@ def _check_values(file: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def _check_together(file: Path, rows: Sequence[Row]) -> None:
     """Refuse an episode that is there twice, and rows of one instance that say different things of it."""
-    seen, first = set[tuple[str, str, int]](), dict[str, Row]()
+    seen, first, scenes = set[tuple[str, str, int]](), dict[str, Row](), dict[str, str]()
     for number, row in enumerate(rows, 1):
         if (episode := (row.instance, row.policy, row.repeat)) in seen:
             raise DataError(f"{file}: row {number}: instance {row.instance!r}, policy {row.policy!r}, repeat {row.repeat} is there twice")
         seen.add(episode)
+        if row.scene is not None and row.scene != (was := scenes.setdefault(row.instance, row.scene)):
+            raise DataError(f"{file}: row {number}: instance {row.instance!r}: its scene is {row.scene!r}, in an earlier row it is {was!r}")
         if row.instance not in first:
             first[row.instance] = row
             if problem := row_fault(row):

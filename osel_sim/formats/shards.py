@@ -75,7 +75,7 @@ class Shards:
 
 
 def _row(data: dict[str, Any], instance: str, place: str) -> Row:
-    if problem := fault(data, ROW, optional=("score", "axes", "robot", "fallback_steps")):
+    if problem := fault(data, ROW, optional=("score", "axes", "robot", "fallback_steps", "scene")):
         raise DataError(f"{place}: not a recorded instance ({problem})")
     row = Row(**data)
     if row.instance != instance or (problem := row_fault(row)):

@@ -63,7 +63,7 @@ OUTCOME = {**_END, "seconds": SECONDS, **_USED, **_TOLD}
 DECISION = {
     **{"index": COUNT, "task": NAME, "seed": COUNT, "level": COUNT, "axes": NAME.or_null, "split": NAME},
     **{"instruction": TEXT, "phrasing": TEXT, "target": TEXT, "container": TEXT, "policy": NAME, "propensities": PROPENSITIES},
-    **{**_END, "seconds": SECONDS, **_USED, "reward": NUMBER.or_null, **_TOLD, "robot": NAME.or_null},
+    **{**_END, "seconds": SECONDS, **_USED, "reward": NUMBER.or_null, **_TOLD, "robot": NAME.or_null, "scene": NAME.or_null},
 }
 """Of `osel_sim.formats.journal.Decision`."""
 ROW = {
@@ -71,7 +71,7 @@ ROW = {
     **{name: TEXT.or_null for name in ("instruction", "phrasing", "target", "container", "robot")},
     **{"policy": NAME, "repeat": COUNT, "success": FLAG, "subgoals": SHARE.or_null, "steps": COUNT.or_null, "score": NUMBER.or_null},
     **{name: AMOUNT.or_null for name in ("upload", "inference", "download", "motion", "price")},
-    **{"calls": COUNT.or_null, "actions": COUNT.or_null, **_TOLD},
+    **{"calls": COUNT.or_null, "actions": COUNT.or_null, **_TOLD, "scene": NAME.or_null},
 }
 """Of `osel_sim.formats.rollout_log.Row`."""
 

@@ -27,6 +27,8 @@ from osel_sim.ingestion.write import IngestedInstance
 from osel_sim.interface.encoder import Image
 from osel_sim.interface.policy import Observation
 from osel_sim.interface.specification import specification
+from osel_sim.policy.history import History
+from osel_sim.policy.mapping import turned_over
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,8 @@ class Dataset:
 
     def images(self, frame: int) -> list[Image]:
         """The images of a frame."""
-        return [self._files.image(self._settings.column(camera), frame) for camera in self._cameras]
+        flips = self._settings.mapping.flip
+        return [turned_over(self._files.image(self._settings.column(camera), frame), flips.get(camera)) for camera in self._cameras]
 
 
 @dataclass(frozen=True)
@@ -91,13 +94,18 @@ class Sample:
     """One logged frame.
 
     Attributes:
-        frame, end: index of the frame, and of the one after its episode's last.
+        start, frame, end: index of its episode's first frame, of the frame, and of the one after the episode's last.
     """
 
     instance: IngestedInstance
     dataset: Dataset
     frame: int
     end: int
+    start: int
+
+    def observations(self, count: int) -> list[Observation]:
+        """What the policies see of the frame and of those before it, `count` at most, the newest last."""
+        return [self.dataset.observation(frame) for frame in range(max(self.start, self.frame - count + 1), self.frame + 1)]
 
 
 def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings: Measurement) -> list[Sample]:
@@ -126,7 +134,7 @@ def open_datasets(folders: Sequence[Path], specs: Sequence[PolicySpec], settings
                 dataset.images(frame)  # a broken one is found before the policies are asked, not after
                 key = f"{name}/{episode:06d}/{frame - start:06d}"
                 instance = IngestedInstance(key, dataset.instruction(frame), digest, partial(dataset.images, frame))
-                samples.append(Sample(instance, dataset, frame, end))
+                samples.append(Sample(instance, dataset, frame, end, start))
     return samples
 
 
@@ -145,8 +153,8 @@ def measure_errors(samples: Sequence[Sample], specs: Sequence[PolicySpec], setti
     rows = []
     with Drivers(specs, specification()) as drivers, progress(len(samples), "frame") as bar:
         for sample in samples:
-            observation = sample.dataset.observation(sample.frame)
-            rows += [measure_one(sample, drivers[spec.name], observation, settings.tolerance) for spec in specs]
+            observations = sample.observations(max(spec.history for spec in specs))
+            rows += [measure_one(sample, drivers[spec.name], observations, settings.tolerance) for spec in specs]
             bar.update()
     return rows, {
         "datasets": sorted({sample.dataset.folder.resolve().name for sample in samples}),
@@ -161,12 +169,25 @@ def action_mse(actions: NDArray[np.float32], logged: NDArray[np.float32]) -> flo
     return float(np.mean(np.square(actions[:steps].astype(np.float64) - logged[:steps])))
 
 
-def measure_one(sample: Sample, driver: Driver, observation: Observation, tolerance: float) -> Row:
-    """Ask one policy for its actions on one sample; a call that fails and a policy that crashes are errors, not scores."""
+def _shown(observation: Observation, spec: PolicySpec) -> Observation:
+    """What one policy is shown of a frame."""
+    pictures = {IMAGES + camera: _resized(observation[IMAGES + camera], spec.image_size) for camera in spec.cameras}
+    return {**pictures, STATE: observation[STATE], "task": observation["task"]}
+
+
+def measure_one(sample: Sample, driver: Driver, observations: Sequence[Observation], tolerance: float) -> Row:
+    """Ask one policy for its actions on one sample; a call that fails and a policy that crashes are errors, not scores.
+
+    Args:
+        observations: of the frame and of those before it, the newest last; no fewer than the policy is shown, as far as the episode has them.
+    """
     spec, key = driver.spec, sample.instance.key
     driver.caller.reset(sample.instance.text, episode_seed(key, spec.name, 0))
-    pictures = {IMAGES + camera: _resized(observation[IMAGES + camera], spec.image_size) for camera in spec.cameras}
-    seen = {**pictures, STATE: observation[STATE], "task": observation["task"]}
+    history = History(spec.history)
+    shown = [_shown(observation, spec) for observation in observations]
+    for earlier in shown[:-1]:
+        history.remember(earlier)
+    seen = history.with_present(shown[-1])
     error: str | None = None
     score: float | None = None
     actions = 0

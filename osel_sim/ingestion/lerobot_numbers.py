@@ -10,7 +10,7 @@ from osel_sim.core.errors import ContentError, DataError
 from osel_sim.formats.dataset_mapping import DatasetMapping
 from osel_sim.ingestion.lerobot_files import DatasetFiles
 from osel_sim.interface.specification import ACTION, ACTION_DIM, STATE, STATE_DIM
-from osel_sim.policy.mapping import actions_of
+from osel_sim.policy.mapping import actions_of, grip_orientation
 
 logger = logging.getLogger(__name__)
 
@@ -25,9 +25,10 @@ def check_mapping(mapping: DatasetMapping, file: Path | None, cameras: tuple[str
         ContentError: it does not.
     """
     where = file or "mapping"
-    for camera in mapping.images:
-        if camera not in cameras:
-            raise ContentError(where, f"images.{camera}", f"no policy has that camera; cameras: {', '.join(cameras)}")
+    for table in ("images", "flip"):
+        for camera in getattr(mapping, table):
+            if camera not in cameras:
+                raise ContentError(where, f"{table}.{camera}", f"no policy has that camera; cameras: {', '.join(cameras)}")
     for key, given, wanted, names in (
         ("state_columns", mapping.state_columns, STATE_DIM, ", ".join(f"{part} {size}" for part, size in STATE.items())),
         ("columns", mapping.columns, ACTION_DIM, ", ".join(ACTION.names)),
@@ -44,7 +45,12 @@ def states(files: DatasetFiles, mapping: DatasetMapping) -> NDArray[np.float32]:
         DataError: the column is missing, of another shape, or has numbers that are none.
     """
     values = files.numbers(mapping.state)
-    return _chosen(files, values, mapping.state, mapping.state_columns, STATE_DIM, "state_columns").astype(np.float32)
+    chosen = _chosen(files, values, mapping.state, mapping.state_columns, STATE_DIM, "state_columns")
+    if mapping.state_frame == "hand":
+        turn = slice(STATE["position"], STATE["position"] + STATE["axis_angle"])
+        chosen = chosen.copy()
+        chosen[:, turn] = grip_orientation(chosen[:, turn])
+    return chosen.astype(np.float32)
 
 
 def actions(files: DatasetFiles, mapping: DatasetMapping) -> NDArray[np.float32]:

@@ -238,3 +238,15 @@ class HasExpert(Protocol):
     def expert(self) -> Expert:
         """The expert of the loaded instance, at the beginning of its plan. It must be looked at by nobody else."""
         ...
+
+
+@runtime_checkable
+class TellsScene(Protocol):
+    """An environment that tells one scene from another, so that outcomes of two logs are compared on the same scenes only."""
+
+    def scene_digest(self) -> str:
+        """Digest of the scene of the loaded instance with its instruction: another one where anything is that an episode depends on.
+
+        It should not depend on last bits, as of a simulation before the first step, which differ from machine to machine.
+        """
+        ...

@@ -11,6 +11,8 @@ Observation = dict[str, Any]
 - `observation.images.<camera>`: uint8 (H, W, 3), RGB, for each camera the policy file names;
 - `observation.state`: float32 (S,): the parts that the environment's specification lists, one after the other; absent where it lists none;
 - `task`: the instruction.
+
+Where the policy file asks for a history of n > 1, images are (n, H, W, 3) and the state is (n, S): successive control steps, the newest last.
 """
 
 Actions = NDArray[np.float32]

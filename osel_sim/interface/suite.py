@@ -4,6 +4,7 @@ import contextlib
 import functools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from osel_sim.core.errors import MissingPackageError, UnknownNameError, UsageError
@@ -26,7 +27,9 @@ class SuiteSpec:
         axes: of perturbation that its levels turn up; a task may allow fewer.
         packages: distributions whose versions `run.json` keeps.
         install: the command that gets it, told where a package is missing.
-        opengl: whether it renders in this process by MuJoCo's OpenGL backend, which `run.json` then keeps and a resumed run must share.
+        opengl: whether it renders by MuJoCo's OpenGL backend, here or in its host, which `run.json` then keeps and a resumed run must share.
+        environments: names of the Python environments of its own that it runs in where it does not fit into this one; none: it always runs here.
+        cannot: what it cannot do, a sentence each.
     """
 
     name: str
@@ -37,6 +40,8 @@ class SuiteSpec:
     packages: tuple[str, ...] = ()
     install: str = ""
     opengl: bool = False
+    environments: tuple[str, ...] = ()
+    cannot: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -102,6 +107,23 @@ class Prepares(Protocol):
     def prepare(self) -> None:
         """Do it, unless it is done."""
         ...
+
+
+@runtime_checkable
+class TakesFolder(Protocol):
+    """A suite of others to which users add tasks by files: `--tasks DIR` holds them in a folder called as the suite is."""
+
+    def with_files(self, folder: Path) -> "Suite":
+        """The same suite with the files of that folder, `DIR/SUITE`.
+
+        Raises:
+            ContentError: one of them is wrong.
+        """
+        ...
+
+
+NO_SNAPSHOTS = "no snapshots: for every policy the instance is started again from the same seed"
+"""What a suite cannot do, of those that can set up no state but the first."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,8 @@ def misfits(spec: PolicySpec, environment: EnvironmentSpec) -> Iterator[tuple[st
     for part in mapping.state_parts if mapping.state else ():
         if part not in parts:
             yield "mapping.state_parts", f"unknown part {part!r}: {did_you_mean(part, parts)}{has} {', '.join(parts) or 'no state'}"
+    if mapping.state and mapping.state_frame == "hand" and "axis_angle" not in environment.state:
+        yield "mapping.state_frame", f"{has} no axis_angle in its state, whose hand's is wanted"
     if mapping.columns and len(mapping.columns) != action.dimension:
         names, given = ", ".join(action.names), list(mapping.columns)
         yield "mapping.columns", f"{has} actions of {action.dimension} numbers ({names}), the policy gives {len(given)}: {given}"

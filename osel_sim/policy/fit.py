@@ -127,11 +127,9 @@ def _others(spec: PolicySpec, config: PreTrainedConfig, fills: bool) -> Iterator
     for key in sorted(set(features) - {*config.image_features, OBS_STATE, OBS_ENV_STATE}):
         hint = f"; is it an image? then it must be called {OBS_IMAGES}.NAME" if "image" in key else ""
         yield f"it wants {key}, which nothing here gives{hint}"
-    chunk = getattr(config, "chunk_size", None) or (getattr(config, "n_action_steps", None) if config.type == "diffusion" else None)
+    steps = getattr(config, "n_action_steps", None) or getattr(config, "action_chunk_size", None)
+    chunk = steps if (config.n_obs_steps or 1) > 1 else getattr(config, "chunk_size", None)
     if chunk is not None and chunk < spec.execute:
         yield f"its chunks hold {chunk} actions, execute = {spec.execute}"
-    if (config.n_obs_steps or 1) > 1 and spec.execute != 1:
-        yield (
-            f"it looks at the last {config.n_obs_steps} observations, which must be one step apart: set execute = 1 "
-            f"(it is asked every step then, and plans anew when its own chunk is used up)"
-        )
+    if (config.n_obs_steps or 1) != spec.history:
+        yield f"it looks at the last {config.n_obs_steps or 1} observations: set history = {config.n_obs_steps or 1} in [observation]"

@@ -15,7 +15,7 @@ import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.policies.pretrained import PreTrainedPolicy
-from lerobot.utils.constants import OBS_ENV_STATE, OBS_IMAGES, OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor
 
@@ -29,7 +29,8 @@ from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Actions, Observation, Policy
 from osel_sim.policy import register
 from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, check_processors
-from osel_sim.policy.mapping import actions_of, state_of
+from osel_sim.policy.history import split
+from osel_sim.policy.mapping import actions_of, image_of, state_of
 from osel_sim.policy.perception_step import PerceptionStep
 from osel_sim.policy.text import embed
 from osel_sim.policy.trust import check_checkpoint
@@ -57,6 +58,7 @@ def load(spec: PolicySpec, environment: EnvironmentSpec) -> Callable[[], Policy]
         seen = {key: shape for step in processors[0].steps if isinstance(step, PerceptionStep) for key, shape in step.image_shapes.items()}
         check_fit(spec, config, environment, seen)
         policy = _weights(spec, checkpoint, config)
+        _check_memory(spec, policy)
         check_normalisation(spec, config, *processors)
     images = {**{key: tuple(feature.shape) for key, feature in config.image_features.items()}, **seen}
     return lambda: LeRobotPolicy(spec, policy, processors, images, environment)
@@ -98,28 +100,42 @@ class LeRobotPolicy:
         self._after.reset()
 
     def act(self, observation: Observation) -> Actions:
-        """The next chunk of actions, (T, D) float32; the same bits for the same observations since the last reset.
-
-        A policy that looks at several observations is asked for one action at a time, as its own memory of them wants it.
-        """
-        config = self._policy.config
-        batch: dict[str, Any] = {"task": self._instruction}
-        for key, shape in self._images.items():
-            size = shape[-2:]
-            batch[key] = _image(observation[f"{OBS_IMAGES}.{self._cameras[key]}"], size) if key in self._cameras else torch.zeros(3, *size)
-        if config.robot_state_feature is not None:
-            batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping, self._environment))
-        if self._context is not None:
-            batch[OBS_ENV_STATE] = self._context
+        """The next chunk of actions, (T, D) float32; the same bits for the same observations since the last reset."""
         with torch.inference_mode(), threads(1), no_foreign_code(), drawing(self._instruction, self._calls):
-            prepared = {key: value for key, value in self._before(batch).items() if isinstance(value, Tensor)}
+            prepared = [self._prepared(one) for one in split(observation)]
             # the postprocessor knows single actions (batch, D): a chunk's steps take the batch's place
-            stepwise = (config.n_obs_steps or 1) > 1
-            chunk = self._policy.select_action(prepared) if stepwise else self._policy.predict_action_chunk(prepared)[0]
+            chunk = self._policy.predict_action_chunk(prepared[0])[0] if len(prepared) == 1 else self._planned(prepared)
             actions = self._after(chunk)
         self._calls += 1
         action = self._environment.action
         return action.clip(actions_of(actions.float().cpu().numpy(), self._mapping, action))
+
+    def _prepared(self, observation: Observation) -> dict[str, Tensor]:
+        """One observation as the network takes it."""
+        config = self._policy.config
+        batch: dict[str, Any] = {"task": self._instruction}
+        for key, shape in self._images.items():
+            size = shape[-2:]
+            batch[key] = _image(image_of(observation, self._cameras[key], self._mapping), size) if key in self._cameras else torch.zeros(3, *size)
+        if config.robot_state_feature is not None:
+            batch[OBS_STATE] = torch.from_numpy(state_of(observation, self._mapping, self._environment))
+        if self._context is not None:
+            batch[OBS_ENV_STATE] = self._context
+        return {key: value for key, value in self._before(batch).items() if isinstance(value, Tensor)}
+
+    def _planned(self, observations: list[dict[str, Tensor]]) -> Tensor:
+        """The chunk (T, D) that a policy with a memory of observations plans from these.
+
+        LeRobot's such policies keep observations and planned actions in queues, and plan when no action is left: with one in it, an observation is
+        only remembered.
+        """
+        self._policy.reset()
+        planned = self._policy._queues[ACTION]
+        for observation in observations[:-1]:
+            planned.append(torch.empty(0))
+            self._policy.select_action(dict(observation))
+        first = self._policy.select_action(dict(observations[-1]))
+        return torch.cat([first, *planned])
 
 
 def _folder(spec: PolicySpec, checkpoint: str) -> Path:
@@ -168,6 +184,16 @@ def _weights(spec: PolicySpec, checkpoint: str, config: PreTrainedConfig) -> Pre
     for parameter in policy.parameters():
         parameter.requires_grad_(False)
     return policy
+
+
+def _check_memory(spec: PolicySpec, policy: PreTrainedPolicy) -> None:
+    """Whether a policy that looks at several observations keeps them as LeRobot's own do."""
+    queues = getattr(policy, "_queues", None)
+    if spec.history > 1 and not (isinstance(queues, dict) and ACTION in queues):
+        raise CheckpointError(
+            f"{spec.file}: checkpoint {spec.checkpoint!r} of type {policy.config.type!r} looks at {spec.history} observations, "
+            "and does not keep them in queues, as LeRobot's diffusion, vqbet and multi_task_dit do"
+        )
 
 
 def _line(error: Exception) -> str:

@@ -10,8 +10,11 @@ from osel_sim.core.errors import PolicyError
 from osel_sim.formats.conventions import STATE_PARTS, Conventions
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.policy import Observation
+from osel_sim.policy.history import split, stacked
 
-STATE = "observation.state"
+IMAGES, STATE = "observation.images.", "observation.state"
+HAND_TURN = np.pi / 2
+"""From the grip site to the hand's body, about the approach axis, radians: the same for all grippers of robosuite that are used here."""
 OPEN_FINGER = 0.04
 """Where a finger of the fully open gripper is, metres."""
 
@@ -43,7 +46,59 @@ def state_of(observation: Observation, mapping: Conventions, environment: Enviro
     for part, size in environment.state.items():
         parts[part] = state[start : start + size]
         start += size
+    if mapping.state_frame == "hand":
+        parts |= hand_orientation(parts["axis_angle"])
     return np.concatenate([_part(parts, part) for part in wanted_parts(mapping, environment)]).astype(np.float32)
+
+
+def image_of(observation: Observation, camera: str, mapping: Conventions) -> NDArray[np.uint8]:
+    """The image of a camera as the policy wants it, uint8 (H, W, 3): resized, then turned over."""
+    image: NDArray[np.uint8] = observation[IMAGES + camera]
+    if mapping.resize is not None and mapping.resize != len(image):
+        from PIL import Image
+
+        image = np.asarray(Image.fromarray(image).resize((mapping.resize, mapping.resize), Image.Resampling.BILINEAR))
+    return turned_over(image, mapping.flip.get(camera))
+
+
+def turned_over(image: NDArray[np.uint8], flip: str | None) -> NDArray[np.uint8]:
+    """An image (H, W, C) turned over in one of the ways of `FLIPS`, or as it is."""
+    if flip in ("vertical", "both"):
+        image = image[::-1]
+    if flip in ("horizontal", "both"):
+        image = image[:, ::-1]
+    return np.ascontiguousarray(image)
+
+
+def hand_orientation(grip: NDArray[np.float64]) -> dict[str, NDArray[np.float64]]:
+    """Orientation of the hand's body, from that of the grip site as axis-angle (3,): `axis_angle` (3,) and `quaternion` (x, y, z, w).
+
+    As robosuite gives it (`robot0_eef_quat`), and as openpi and LeRobot make axis-angle of it for LIBERO. Of the two quaternions that mean the same
+    orientation, the one with a positive x is taken, which is the Panda's own as it works: then the angle is about half a turn for a gripper that
+    points down, and may be more.
+    """
+    quaternion = _turned(grip, HAND_TURN)
+    return {"axis_angle": _axis_angle(quaternion), "quaternion": quaternion}
+
+
+def grip_orientation(hand: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Orientation of the grip site as axis-angle (..., 3), as our environments have it, from that of the hand's body as axis-angle (..., 3)."""
+    return _axis_angle(_turned(hand, -HAND_TURN))
+
+
+def _turned(axis_angle: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
+    """Orientations (..., 3) turned about their own z axis, as quaternions (x, y, z, w) with x >= 0, (..., 4)."""
+    from scipy.spatial.transform import Rotation
+
+    quaternions: NDArray[np.float64] = (Rotation.from_rotvec(axis_angle) * Rotation.from_euler("z", turn)).as_quat()
+    return np.where(quaternions[..., :1] < 0, -quaternions, quaternions)
+
+
+def _axis_angle(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Axis-angle (..., 3) of quaternions (x, y, z, w), with angles up to a whole turn."""
+    half = np.arccos(np.clip(quaternions[..., 3:], -1.0, 1.0))
+    sine = np.sin(half)
+    return np.where(sine > 1e-9, quaternions[..., :3] * (2 * half / np.maximum(sine, 1e-9)), 0.0)
 
 
 def _part(parts: dict[str, NDArray[np.float64]], part: str) -> NDArray[np.float64]:
@@ -57,11 +112,12 @@ def _part(parts: dict[str, NDArray[np.float64]], part: str) -> NDArray[np.float6
 
 
 def message_of(observation: Observation, mapping: Conventions, cameras: tuple[str, ...], environment: EnvironmentSpec) -> dict[str, Any]:
-    """An observation under the policy's own names."""
-    message: dict[str, Any] = {mapping.key(camera): observation[f"observation.images.{camera}"] for camera in cameras}
+    """An observation, or a stack of successive ones, under the policy's own names."""
+    if len(single := split(observation)) > 1:
+        return stacked([message_of(one, mapping, cameras, environment) for one in single])
+    message: dict[str, Any] = {mapping.key(camera): image_of(observation, camera, mapping) for camera in cameras}
     if cameras:
-        shape = observation[f"observation.images.{cameras[0]}"].shape
-        message |= {key: np.zeros(shape, np.uint8) for key in mapping.blank}
+        message |= {key: np.zeros_like(message[mapping.key(cameras[0])]) for key in mapping.blank}
     if mapping.state and environment.state:
         message[mapping.state] = state_of(observation, mapping, environment)
     message[mapping.prompt] = observation["task"]

@@ -37,6 +37,7 @@ def as_policy(
     *,
     cameras: Sequence[str] | None = None,
     image_size: int = 96,
+    history: int = 1,
     execute: int = 1000,
     inference_seconds: float = 0.0,
     price_per_action: float = 0.0,
@@ -47,6 +48,7 @@ def as_policy(
         policy: an object with `reset(instruction)` and `act(observation)`, which returns actions (T, D) float32.
         name: what it is called; None: its class's name in small letters.
         cameras, image_size: what it is shown (square, pixels); None: all cameras that there are.
+        history: how many successive observations it is shown at a call, the newest last.
         execute: actions of each chunk that are executed before it is asked again; at most the chunk's length.
         inference_seconds: declared time of one inference on the virtual clock.
         price_per_action: cents for each executed action.
@@ -57,8 +59,12 @@ def as_policy(
     for method in ("reset", "act"):
         if not callable(getattr(policy, method, None)):
             raise UsageError(f"policy {type(policy).__name__!r} has no method {method!r}; a policy has reset(instruction) and act(observation)")
-    if not (16 <= image_size <= 1024 and 1 <= execute <= 1000 and 0 <= inference_seconds <= 3600 and 0 <= price_per_action <= 1e6):
-        ranges = "image_size in [16, 1024], execute in [1, 1000], inference_seconds in [0, 3600] and price_per_action in [0, 1000000]"
+    if not (
+        16 <= image_size <= 1024 and 1 <= history <= 16 and 1 <= execute <= 1000 and 0 <= inference_seconds <= 3600 and 0 <= price_per_action <= 1e6
+    ):
+        ranges = (
+            "image_size in [16, 1024], history in [1, 16], execute in [1, 1000], inference_seconds in [0, 3600] and price_per_action in [0, 1000000]"
+        )
         raise UsageError(f"a policy's numbers must lie in these ranges, as in a policy file: {ranges}")
     kind = type(policy)
     name = name or re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", kind.__name__).lower()
@@ -69,6 +75,7 @@ def as_policy(
         checkpoint="",
         cameras=tuple(cameras or ()),
         image_size=image_size,
+        history=history,
         execute=execute,
         inference_seconds=inference_seconds,
         remote=None,

@@ -15,7 +15,7 @@ from osel_sim.policy.environment_fit import check_environment
 from osel_sim.policy.mapping import message_of
 from osel_sim.remote.client import Answer, HungUpError, NoAnswerError, RemoteClient, UnsentError
 from osel_sim.remote.network import Delays, NetworkModel, NetworkProfile, profile
-from osel_sim.remote.process import PolicyServerProcess
+from osel_sim.remote.policy_process import PolicyServerProcess
 from osel_sim.remote.protocol import STATE, TOKEN_VARIABLE, Greeting, example_observation, select_observation
 
 DEADLINE = "deadline"

@@ -1,28 +1,25 @@
-"""A policy server in a process of its own, on loopback, that never outlives the process that started it."""
+"""A server in a process of its own, on loopback, that never outlives the process that started it: of a policy, or of another suite's simulator."""
 
 import contextlib
 import json
 import os
 import secrets
 import subprocess
-import sys
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from multiprocessing.connection import wait
 from typing import IO, Self
 
 from osel_sim.core.errors import RemoteError
-from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.interface.environment import EnvironmentSpec
-from osel_sim.remote.client import RemoteClient
-from osel_sim.remote.protocol import TOKEN_VARIABLE, Greeting
+from osel_sim.core.shown import TOKEN_VARIABLE
 
 STOP_SECONDS = 8.0
 ERROR_LINES = 5
 
 
-class PolicyServerProcess:
-    """Runs `python -m osel_sim.serve` for one policy file.
+class ServerProcess(ABC):
+    """A process that serves on loopback.
 
     It says where it listens on a pipe of its own: standard output belongs to whatever is loaded into it, and is kept with its errors.
 
@@ -30,19 +27,24 @@ class PolicyServerProcess:
     process dies, however it dies, the pipe ends and the server goes too.
 
     Args:
-        spec: which policy.
-        environment: what it will drive.
-        timeout: real seconds for one answer, of the clients given out.
-        start_timeout: real seconds for loading the weights.
+        what: it is, for messages.
+        start_timeout: real seconds until it must be ready.
     """
 
-    def __init__(self, spec: PolicySpec, environment: EnvironmentSpec, timeout: float = 30.0, start_timeout: float = 120.0) -> None:
-        self._environment = environment
-        self._spec, self._timeout, self._start_timeout = spec, timeout, start_timeout
+    def __init__(self, what: str, start_timeout: float) -> None:
+        self._what, self._start_timeout = what, start_timeout
         self._process: subprocess.Popen[str] | None = None
         self._errors: IO[str] | None = None
         self.token = ""
         self.url = ""
+
+    @abstractmethod
+    def command(self, ready: int) -> list[str]:
+        """The command line that starts it.
+
+        Args:
+            ready: descriptor to which it writes `{"url": ...}` when it listens.
+        """
 
     def __enter__(self) -> Self:
         self.start()
@@ -72,14 +74,12 @@ class PolicyServerProcess:
         self.close()
         self.token = secrets.token_urlsafe(32)
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115 - closed in close()
-        name, folder, environment = self._spec.file.stem, str(self._spec.file.parent), json.dumps(self._environment.to_dict())
         ours, theirs = os.pipe()
-        flags = ["--port=0", f"--policies-dir={folder}", f"--environment={environment}", "--watch-stdin", f"--ready-fd={theirs}"]
         try:
             with open(ours, "rb", buffering=0) as ready:
                 with open(theirs, "wb"):
                     self._process = subprocess.Popen(
-                        [sys.executable, "-m", "osel_sim.serve", name, *flags],
+                        self.command(theirs),
                         stdin=subprocess.PIPE,
                         stdout=self._errors,
                         stderr=self._errors,
@@ -92,15 +92,6 @@ class PolicyServerProcess:
         except BaseException:
             self.close()
             raise
-
-    def start_client(self) -> RemoteClient:
-        """Start the server if it does not run, and give a client for it, not yet connected.
-
-        Raises:
-            RemoteError: as `start`.
-        """
-        self.start()
-        return RemoteClient(self.url, self._environment, self.token, self._timeout, Greeting.of(self._spec, self._environment))
 
     def close(self) -> None:
         """Stop the server: politely, then not. May be called twice."""
@@ -128,9 +119,9 @@ class PolicyServerProcess:
                 line += part
                 ended = ended or not part
             elif not ended and time.monotonic() > end:
-                raise RemoteError(f"the policy server of {self._spec.name!r} was not ready within {self._start_timeout:g} s{self._last_lines()}")
+                raise RemoteError(f"{self._what} was not ready within {self._start_timeout:g} s{self._last_lines()}")
             if ended and not line.endswith(b"\n"):
-                raise RemoteError(f"the policy server of {self._spec.name!r} did not start{self._last_lines()}")
+                raise RemoteError(f"{self._what} did not start{self._last_lines()}")
         return str(json.loads(line)["url"])
 
     def _last_lines(self) -> str:

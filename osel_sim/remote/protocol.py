@@ -17,7 +17,8 @@ from osel_sim.core.shown import TOKEN_VARIABLE as TOKEN_VARIABLE  # where others
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
 from osel_sim.interface.policy import Observation
-from osel_sim.interface.specification import specification
+from osel_sim.interface.specification import CAMERAS, specification
+from osel_sim.interface.specification import STATE as STATE_PARTS
 from osel_sim.remote.codec import ProtocolError
 
 PROTOCOL = "osel_sim/1"
@@ -41,6 +42,8 @@ class Greeting:
         cameras, image_size: what it wants to be shown (square, pixels).
         action_dim, state_dim: how many numbers its actions have, and the states it wants; 0: no state.
         action: bounds that the server clips actions to; None: clients do. It is not sent.
+        libero: whether clients of openpi's LIBERO example are understood: the environment has the cameras and the state that they send. Not sent.
+        history: how many successive observations it wants at a call; sent where it is more than one.
     """
 
     policy: str
@@ -49,12 +52,16 @@ class Greeting:
     action_dim: int
     state_dim: int
     action: ActionSpec | None = field(default=None, compare=False, repr=False)
+    libero: bool = field(default=False, compare=False, repr=False)
+    history: int = 1
 
     @classmethod
     def of(cls, spec: PolicySpec, environment: EnvironmentSpec | None = None) -> "Greeting":
         """The greeting of the server of one policy file, which drives in an environment; None: one of ours."""
         environment = environment or specification()
-        return cls(spec.name, spec.cameras, spec.image_size, environment.action.dimension, environment.state_size, environment.action)
+        ours = dict(environment.state) == STATE_PARTS and list(environment.state) == list(STATE_PARTS) and set(spec.cameras) <= set(CAMERAS)
+        action = environment.action
+        return cls(spec.name, spec.cameras, spec.image_size, action.dimension, environment.state_size, action, ours, spec.history)
 
     def to_dict(self) -> dict[str, Any]:
         """The metadata map as it is sent."""
@@ -66,6 +73,7 @@ class Greeting:
             "action_dim": self.action_dim,
             "state_dim": self.state_dim,
             "reset": RESET,
+            **({"history": self.history} if self.history > 1 else {}),
         }
 
     @classmethod
@@ -84,14 +92,15 @@ class Greeting:
             raise ProtocolError(f"the server speaks {protocol[:40]!r}, this client {PROTOCOL!r}")
         policy, cameras = metadata.get("policy"), metadata.get("cameras")
         sizes: list[Any] = [metadata.get(key) for key in ("image_size", "action_dim", "state_dim")]
+        history = metadata.get("history", 1)
         if (
             not isinstance(policy, str)
             or not isinstance(cameras, list)
             or not all(isinstance(item, str) for item in cameras)
-            or not all(type(size) is int for size in sizes)
+            or not all(type(size) is int for size in [*sizes, history])
         ):
             raise ProtocolError("the greeting lacks policy, cameras, image_size, action_dim or state_dim")
-        return cls(policy, tuple(cameras), *sizes)
+        return cls(policy, tuple(cameras), sizes[0], sizes[1], sizes[2], history=history)
 
 
 def select_observation(observation: Observation, cameras: tuple[str, ...], state: bool = True) -> Observation:
@@ -122,14 +131,15 @@ def check_observation(value: Any, greeting: Greeting) -> Observation:
     if value.keys() != expected:
         got = ", ".join(sorted(str(key)[:60] for key in list(value)[:20])) or "none"
         raise ObservationError(f"expected the keys {', '.join(sorted(expected))}, got {got}")
-    shape = (greeting.image_size, greeting.image_size, 3)
+    stack = (greeting.history,) if greeting.history > 1 else ()
+    shape = (*stack, greeting.image_size, greeting.image_size, 3)
     for camera in greeting.cameras:
         _array(value, IMAGES + camera, ("uint8",), shape)
     checked = {**value, TASK: check_instruction(value[TASK])}
     if not greeting.state_dim:
         return checked
     with np.errstate(over="ignore"):
-        state = _array(value, STATE, ("float32", "float64"), (greeting.state_dim,)).astype(np.float32)
+        state = _array(value, STATE, ("float32", "float64"), (*stack, greeting.state_dim)).astype(np.float32)
     if not np.isfinite(state).all():
         raise ObservationError(f"{STATE} contains NaN or infinity")
     return {**checked, STATE: state}
@@ -150,15 +160,15 @@ def check_instruction(value: Any) -> str:
 
 def example_observation(greeting: Greeting) -> Observation:
     """Zeros in the right form: to warm a policy up, and for tests."""
-    size = greeting.image_size
-    images = {IMAGES + camera: np.zeros((size, size, 3), np.uint8) for camera in greeting.cameras}
-    state = {STATE: np.zeros(greeting.state_dim, np.float32)} if greeting.state_dim else {}
+    size, stack = greeting.image_size, (greeting.history,) if greeting.history > 1 else ()
+    images = {IMAGES + camera: np.zeros((*stack, size, size, 3), np.uint8) for camera in greeting.cameras}
+    state = {STATE: np.zeros((*stack, greeting.state_dim), np.float32)} if greeting.state_dim else {}
     return {**images, **state, TASK: "pick up the can"}
 
 
 def largest_observation(greeting: Greeting) -> int:
     """Bytes of the largest message a client may send, with room for a longer one to be answered instead of cut off."""
-    return 2 * len(greeting.cameras) * 3 * greeting.image_size**2 + (1 << 20)
+    return 2 * greeting.history * len(greeting.cameras) * 3 * greeting.image_size**2 + (1 << 20)
 
 
 def check_token(token: str) -> str:

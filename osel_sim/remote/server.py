@@ -21,6 +21,7 @@ from osel_sim.policy.local import check_form
 from osel_sim.policy.registry import MakeSession
 from osel_sim.remote.address import cannot_listen
 from osel_sim.remote.codec import ProtocolError, pack, unpack
+from osel_sim.remote.libero_client import is_libero, read_libero
 from osel_sim.remote.protocol import (
     HEALTH,
     RESET,
@@ -61,7 +62,7 @@ class Session:
                 raise ProtocolError(f"a reset has the one key {RESET!r}")
             self._reset(check_instruction(message[RESET]))
             return pack(message)
-        observation = check_observation(message, self._greeting)
+        observation = check_observation(read_libero(message, self._greeting) if is_libero(message) else message, self._greeting)
         if observation[TASK] != self._instruction:
             self._reset(observation[TASK])
         start = time.perf_counter()

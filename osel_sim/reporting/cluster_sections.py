@@ -33,7 +33,7 @@ class Replayed:
 
     Attributes:
         points: of each at the weights given, as `osel_sim.analysis.frontier.measured` names it.
-        swept: what they came to at others, as `osel_sim.analysis.frontier.selector_frontiers` gives it; None where that was not replayed.
+        swept: what they came to at others, as `osel_sim.analysis.frontier.FrontierPlan` gives it; None where that was not replayed.
         look: of each.
     """
 

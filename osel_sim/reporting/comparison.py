@@ -1,5 +1,6 @@
 """A comparison as rows of text, which the terminal and Markdown show alike, and as JUnit XML."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
@@ -73,6 +74,14 @@ def notes(entry: Mapping[str, Any]) -> list[str]:
         found.append(
             f"Episodes that ended in error are nobody's failure: {entry['errors']['first']} of {first}, {entry['errors']['second']} of {second}."
         )
+    if entry["looks"]:
+        found.append(
+            f"Stopped by what it showed, after {entry['looks']} looks: the interval and the p of success hold at every one of them, "
+            "those of tasks and other measures are those of a fixed number of instances."
+        )
+    if entry["same_scene"] < entry["instances"]:
+        known = f" of {entry['instances'] - entry['same_scene']} of them" if entry["same_scene"] else ""
+        found.append(f"Paired by key alone: the logs do not tell the scenes{known} (of an earlier version, or from elsewhere).")
     found += [f"No {name}: {reason}." for name, reason in entry["missing"].items()]
     worse = [task for task, part in entry["tasks"].items() if part["decision"] == "worse"]
     if worse and entry["verdict"]["decision"] != "worse":
@@ -121,19 +130,20 @@ def junit(result: Mapping[str, Any]) -> str:
     entries = [entry for entry in result["pairs"] if entry["first"] == first]
     decisions = [entry["verdict"]["decision"] for entry in entries]
     failures, skipped = decisions.count("worse"), decisions.count("not enough data")
-    counts = {"tests": str(len(entries)), "failures": str(failures), "errors": "0", "skipped": str(skipped)}
-    suite = ElementTree.Element("testsuite", {"name": "osel_sim.compare", **counts})
+    counts = {"tests": str(len(entries)), "failures": str(failures), "errors": "0"}
+    suite = ElementTree.Element("testsuite", {"name": "osel_sim.compare", **counts, "skipped": str(skipped), "time": "0"})
     for entry in entries:
-        case = ElementTree.SubElement(suite, "testcase", {"classname": "osel_sim.compare", "name": shown(f"{entry['second']} against {first}")})
-        kind = {"worse": "failure", "not enough data": "skipped"}.get(entry["verdict"]["decision"])
-        if kind:
-            ElementTree.SubElement(case, kind, {"message": shown(entry["verdict"]["text"])})
+        name = shown(f"{entry['second']} against {first}")
+        case = ElementTree.SubElement(suite, "testcase", {"classname": "osel_sim.compare", "name": name, "time": "0"})
+        kind, told = {"worse": "failure", "not enough data": "skipped"}.get(entry["verdict"]["decision"]), shown(entry["verdict"]["text"])
+        if kind:  # some readers show the message, some the text
+            ElementTree.SubElement(case, kind, {"message": told, **({"type": "worse"} if kind == "failure" else {})}).text = told
         lines = [entry["verdict"]["text"], *notes(entry), *("  ".join(row) for row in (*difference_rows(entry), *task_rows(entry)[1:]))]
         ElementTree.SubElement(case, "system-out").text = shown("\n".join(lines))
     suites = ElementTree.Element("testsuites", counts)
     suites.append(suite)
     ElementTree.indent(suites)
-    return ElementTree.tostring(suites, encoding="unicode", xml_declaration=False) + "\n"
+    return '<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(suites, encoding="unicode") + "\n"
 
 
 def _value(name: str, value: float, found: Mapping[str, Any]) -> str:
@@ -159,6 +169,8 @@ def _table(rows: Sequence[tuple[str, ...]]) -> str:
 
 
 def _marked(text: str) -> str:
-    """A text of others as Markdown shows it, in one line: no markup, no HTML, no end of a cell."""
-    text = shown(text).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;").replace("\n", " ")
-    return "".join(f"\\{character}" if character in "\\`*_{}[]|#@~!$" else character for character in text)
+    """A text of others as Markdown shows it, in one line: no markup, no HTML, no end of a cell, and nobody and nothing mentioned or linked."""
+    text = " ".join(shown(text).split()).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    text = "".join(f"\\{character}" if character in "\\`*_{}[]|#@~!$" else character for character in text)
+    # Servers look for names and addresses in what was rendered, where an escape is gone; an empty comment stays.
+    return re.sub(r"(?<!\w)\\[@#](?=\w)|://|(?i:\bwww\.)", lambda found: f"{found[0]}<!-- -->", text)

@@ -17,7 +17,7 @@ from osel_sim.analysis.measures import curves, measure_fixed
 from osel_sim.analysis.oracles import oracles
 from osel_sim.context.appended import TASK_NAME
 from osel_sim.core.errors import DataError, UsageError
-from osel_sim.formats.replay_result import REPLAY, Choices, read_replay
+from osel_sim.formats.replay_result import PENDING, REPLAY, Choices, read_replay
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.reporting.charts import Figure, Look
 from osel_sim.reporting.cluster_sections import Replayed
@@ -140,6 +140,7 @@ def _page(replay: _Replay, scenes: Scenes) -> Page:
     selectors += [off_policy_table(result["off_policy"])] if result.get("off_policy") else []
     shared, _ = log_sections(log, weights, Replayed(_points(log, weights, choices, learners), result.get("frontier"), look))
     title = f"{few(result['log']['tasks'])}: {len(learners)} selectors over {choices.order.shape[1]:,} decisions, {len(choices.order)} seeds"
+    title += f" so far; still being replayed: {few(result[PENDING])}" if result.get(PENDING) else ""
     who = _speaker(result)
     routes = route_figure(log, weights, _chosen(choices, who, names) if who in names else None)
     sections = [Section("selectors", "Selectors", selectors), *shared]

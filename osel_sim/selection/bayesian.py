@@ -147,10 +147,12 @@ class BayesianSelector(SelectorBase):
         self._chosen: list[int] = []
         self._targets: list[float] = []
         self._counts = np.zeros(len(self.policies), np.int64)
-        self._next_fit = 1
+        self._known, self._next_fit = 0, 1
+        self._seen: tuple[Context, NDArray[np.float32], Array] | None = None
+        self._transformed: tuple[NDArray[np.float32], Array] | None = None
         self._centre, self._deviation, self._signal = 0.0, DEVIATION, 0.0
         self._regression: SharedRegression
-        self._fit()
+        self._fit(0)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -161,11 +163,13 @@ class BayesianSelector(SelectorBase):
     @property
     def signal(self) -> float:
         """How much the context matters to the differences between policies by the evidence so far: variance relative to the noise."""
+        self._catch_up()
         return self._signal
 
     @property
     def parts_used(self) -> str:
         """Which parts of a context the features are of by the evidence so far: `first`, `both` or `second`; `whole` where it has no parts."""
+        self._catch_up()
         return ("first", "both", "second")[self._view] if self._prior.parts else "whole"
 
     @property
@@ -173,7 +177,8 @@ class BayesianSelector(SelectorBase):
         return self._views[self._view]
 
     def _select(self, context: Context) -> Choice:
-        prior, rows = self._prior, self._rows(context, self._sketch(context))
+        self._catch_up()
+        prior, rows = self._prior, self._rows(context)
         means, variances = self._regression.predict(rows)
         of_mean = np.minimum(variances, 1.0 / (self._counts + 1.0 / MEAN))
         of_context = variances - of_mean
@@ -189,23 +194,32 @@ class BayesianSelector(SelectorBase):
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
-        sketched, index = self._sketch(context), self.policies.index(choice.policy)
-        row, heads = self._rows(context, sketched)[index], len(self._guess)
-        self._contexts.append(np.array(sketched))
-        self._heads.append(row[:heads].copy())
+        sketched, heads = self._see(context)
+        index = self.policies.index(choice.policy)
+        self._contexts.append(sketched)
+        self._heads.append(heads[index].copy())
         self._chosen.append(index)
         self._counts[index] += 1
         self._targets.append(float(reward + self._costs[index]))
-        if len(self._targets) < self._next_fit:
-            self._regression.update(index, row, self._standard(self._targets[-1]) - float(row[:heads] @ self._guess))
-            return
-        self._fit()
-        self._next_fit = max(len(self._targets) + 1, math.ceil(len(self._targets) * GROWTH))
 
-    def _fit(self) -> None:
-        """Scale, features, evidence and regression from all that was seen; from the prior alone at first."""
-        contexts = np.array(self._contexts, np.float64).reshape(-1, self._sketch.dim)
-        targets, chosen = np.array(self._targets), np.array(self._chosen, np.int64)
+    def _catch_up(self) -> None:
+        """Learn from what came since the last choice. Of several fits that are due only the last is computed, as nothing is left of those before: a
+        warm start with thousands of outcomes is quick."""
+        count, due = len(self._targets), 0
+        while self._next_fit <= count:
+            due, self._next_fit = self._next_fit, max(self._next_fit + 1, math.ceil(self._next_fit * GROWTH))
+        if due:
+            self._fit(due)
+        for at in range(self._known, count):
+            row = np.concatenate([self._heads[at], self._transform(self._contexts[at])[0]])
+            target = self._standard(self._targets[at]) - float(self._heads[at] @ self._guess)
+            self._regression.update(self._chosen[at], row, target)
+        self._known = count
+
+    def _fit(self, count: int) -> None:
+        """Scale, features, evidence and regression from the first so many decisions; from the prior alone at first."""
+        contexts = np.array(self._contexts[:count], np.float64).reshape(-1, self._sketch.dim)
+        targets, chosen = np.array(self._targets[:count]), np.array(self._chosen[:count], np.int64)
         self._measure(chosen, targets)
         targets = self._standard(targets)
         found = []
@@ -215,10 +229,11 @@ class BayesianSelector(SelectorBase):
             found.append(self._regress(contexts, chosen, targets))
         self._view = int(np.argmax([evidence for evidence, _, _ in found]))
         _, self._signal, self._regression = found[self._view]
+        self._known, self._transformed = count, None
 
     def _regress(self, contexts: Array, chosen: NDArray[np.int64], targets: Array) -> tuple[float, float, SharedRegression]:
         """Evidence for the features that there are now, how much they matter by it, and the regression on them."""
-        heads = np.array(self._heads, np.float64).reshape(-1, len(self._guess))
+        heads = np.array(self._heads[: len(targets)], np.float64).reshape(-1, len(self._guess))
         rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
         moments = Moments.of(rows, chosen, targets - heads @ self._guess, len(self._costs))
         own = (NOTHING, *(float(signal) for signal in self._prior.signals)) if self._features.dim and len(targets) > 1 else (NOTHING,)
@@ -255,15 +270,28 @@ class BayesianSelector(SelectorBase):
         """Prior variances of a mean, or two, and of the features' weights."""
         return np.concatenate([np.full(len(self._guess), MEAN), np.full(self._features.dim, signal)])
 
-    def _rows(self, context: Context, sketched: NDArray[np.float32]) -> Array:
+    def _rows(self, context: Context) -> Array:
         """What the regression sees of a context, (P, 1 + dim): a constant for the mean, and the features.
 
         With skills (P, 2 + dim): how far a policy declares what is asked for, and how far not, instead of the constant.
         """
-        features = self._features.transform(sketched[None].astype(np.float64))
-        share = np.ones((len(self._costs), 1)) if self._skills is None else self._skills.share(context[: self._first], self.policies)[:, None]
-        heads = share if self._skills is None else np.concatenate([share, 1.0 - share], axis=1)
+        sketched, heads = self._see(context)
+        features = self._transform(sketched)
         return np.concatenate([heads, np.broadcast_to(features, (len(heads), features.shape[1]))], axis=1)
+
+    def _see(self, context: Context) -> tuple[NDArray[np.float32], Array]:
+        """A context's sketch, and the constants of its rows. `update` mostly asks for what `select` asked for before."""
+        if self._seen is None or not np.array_equal(self._seen[0], context):
+            share = np.ones((len(self._costs), 1)) if self._skills is None else self._skills.share(context[: self._first], self.policies)[:, None]
+            heads = share if self._skills is None else np.concatenate([share, 1.0 - share], axis=1)
+            self._seen = context.copy(), np.array(self._sketch(context)), heads
+        return self._seen[1:]
+
+    def _transform(self, sketched: NDArray[np.float32]) -> Array:
+        """Features of a context, (1, dim)."""
+        if self._transformed is None or self._transformed[0] is not sketched:
+            self._transformed = sketched, self._features.transform(sketched[None].astype(np.float64))
+        return self._transformed[1]
 
     def _cost(self, policy: str) -> float:
         if self._costs_declared is None:
@@ -284,11 +312,14 @@ class BayesianSelector(SelectorBase):
         return self._sketch(few).astype(np.float64), content_digest(table.tobytes())
 
     def _add_policy(self, name: str) -> None:
+        self._catch_up()
         self._costs = np.append(self._costs, self._cost(name))
         self._counts = np.append(self._counts, 0)
-        self._fit()
+        self._seen = None
+        self._fit(len(self._targets))
 
     def _state(self) -> State:
+        self._catch_up()
         return {
             "contexts": np.array(self._contexts, np.float32).reshape(-1, self._sketch.dim),
             "heads": np.array(self._heads, np.float64).reshape(-1, len(self._guess)),
@@ -310,6 +341,7 @@ class BayesianSelector(SelectorBase):
         self._regression = SharedRegression(**{key: copy(value) for key, value in _part(state, "regression.").items()})
         self._view = state.get("view", 0)
         self._features.load(_part(state, "features."))
+        self._known, self._seen, self._transformed = len(self._targets), None, None
 
 
 def _part(state: State, prefix: str) -> State:

@@ -76,11 +76,19 @@ def table_rounds(contexts: ArrayLike, rewards: ArrayLike, in_order: bool = False
         in_order: go through the rows from the first, and over again; else draw a row at random with replacement.
 
     Raises:
-        UsageError: the shapes do not fit each other.
+        UsageError: the shapes do not fit each other, or a number is none, such as the reward of a policy that a log has no outcome of.
     """
     context_rows, reward_rows = np.asarray(contexts, np.float32), np.asarray(rewards, np.float64)
     if context_rows.ndim != 2 or reward_rows.ndim != 2 or len(context_rows) != len(reward_rows) or not len(context_rows):
         raise UsageError(f"contexts (instances, dim) and rewards (instances, policies) do not fit: {context_rows.shape}, {reward_rows.shape}")
+    for name, rows in (("contexts", context_rows), ("rewards", reward_rows)):
+        wrong = np.argwhere(~np.isfinite(rows))
+        if len(wrong):
+            row, column = wrong[0].tolist()
+            raise UsageError(
+                f"{name}[{row}, {column}] is {rows[row, column]} ({len({first for first, _ in wrong.tolist()})} of {len(rows)} rows have such); "
+                f"keep the others: np.isfinite({name}).all(axis=1)"
+            )
     drawn = 0
 
     def draw(generator: np.random.Generator) -> Round:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from osel_sim.sim import table_tops as tables
 from osel_sim.sim.perturbation import CLEAN, CameraShift, Perturbation
 from osel_sim.sim.scene import AGENTVIEW_TARGET
+from osel_sim.sim.turning import nudged, shifted, turned_light
 
 Array = NDArray[np.float64]
 
@@ -81,34 +82,25 @@ class Appearance:
             self._scale(name, size)
 
     def _light(self, perturbation: Perturbation) -> None:
-        import mujoco
-
         headlight = self.model.vis.headlight
         headlight.ambient[:], headlight.diffuse[:] = (clean * perturbation.ambient for clean in self._headlight)
         if perturbation.lamp_turn == CLEAN.lamp_turn and perturbation.lamp == CLEAN.lamp:
             return
         self.model.light_diffuse[:] *= perturbation.lamp
         for light in range(self.model.nlight):
-            turned = np.empty(3)
-            mujoco.mju_rotVecQuat(turned, self.model.light_dir[light].copy(), _turn(np.array([*perturbation.lamp_turn, 0.0])))
-            self.model.light_dir[light] = turned
+            self.model.light_dir[light] = turned_light(self.model.light_dir[light].copy(), perturbation.lamp_turn)
 
     def _cameras(self, perturbation: Perturbation) -> None:
-        import mujoco
-
         model = self.model
         if perturbation.camera != CameraShift():
             index = model.camera(self.cameras["agentview"]).id
-            model.cam_pos[index], model.cam_quat[index] = _shifted(model.cam_pos[index].copy(), model.cam_quat[index].copy(), perturbation.camera)
+            position, quaternion = model.cam_pos[index].copy(), model.cam_quat[index].copy()
+            model.cam_pos[index], model.cam_quat[index] = shifted(position, quaternion, perturbation.camera, np.array(AGENTVIEW_TARGET))
             model.cam_fovy[index] += perturbation.camera.fovy
         if any(perturbation.wrist):
             index = model.camera(self.cameras["wrist"]).id
-            offset, turned = np.empty(3), np.empty(4)
-            own = model.cam_quat[index].copy()
-            mujoco.mju_rotVecQuat(offset, np.array(perturbation.wrist[:3]), own)
-            mujoco.mju_mulQuat(turned, own, _turn(np.array(perturbation.wrist[3:])))
-            model.cam_pos[index] += offset
-            model.cam_quat[index] = turned
+            position, quaternion = model.cam_pos[index].copy(), model.cam_quat[index].copy()
+            model.cam_pos[index], model.cam_quat[index] = nudged(position, quaternion, perturbation.wrist)
 
     def _table(self, perturbation: Perturbation) -> None:
         if not perturbation.table:
@@ -174,29 +166,3 @@ def _within(model: Any, body: int, root: int) -> bool:
 def _scale_boxes(model: Any, first: int, count: int, size: float) -> None:
     if count:
         model.bvh_aabb[first : first + count] *= size
-
-
-def _shifted(position: Array, quaternion: Array, shift: CameraShift) -> tuple[Array, Array]:
-    """Pose of a camera turned about what it looks at."""
-    import mujoco
-
-    pivot = np.array(AGENTVIEW_TARGET)
-    right = np.empty(3)
-    mujoco.mju_rotVecQuat(right, np.array([1.0, 0.0, 0.0]), quaternion)
-    turn, moved, turned, rolled = np.empty(4), np.empty(3), np.empty(4), np.empty(4)
-    mujoco.mju_mulQuat(turn, _turn(np.array([0.0, 0.0, shift.azimuth])), _turn(-shift.elevation * right))
-    mujoco.mju_rotVecQuat(moved, (position - pivot) * shift.distance, turn)
-    mujoco.mju_mulQuat(turned, turn, quaternion)
-    mujoco.mju_mulQuat(rolled, turned, _turn(np.array([0.0, 0.0, shift.roll])))
-    return pivot + moved + np.array(shift.shift), rolled
-
-
-def _turn(vector: Array) -> Array:
-    """Quaternion (w, x, y, z) of an axis-angle vector."""
-    import mujoco
-
-    angle = float(np.linalg.norm(vector))
-    quaternion = np.array([1.0, 0.0, 0.0, 0.0])
-    if angle:
-        mujoco.mju_axisAngle2Quat(quaternion, vector / angle, angle)
-    return quaternion

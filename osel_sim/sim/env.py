@@ -41,6 +41,9 @@ class EnvSnapshot:
 class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
     """One task. Actions are 7-d OSC_POSE deltas in [-1, 1] at 20 Hz; the reward is 1 on the step that fulfils the goal.
 
+    Observations of `reset` and `step` are a dictionary of `state` (8,) and, for each camera, `image_CAMERA` (image_size, image_size, 3): names that
+    torch takes for a network's parts, as stable-baselines3 does. `observe` has the same under LeRobot's names.
+
     Args:
         task: a task file's spec, or the name of one.
         split, level, axes: which instances `reset` draws, as `make_instance` takes them.
@@ -95,9 +98,9 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         self._images = Cameras(self.world.model, self.world.scene.xml, self.world.appearance)
         self.world.load(self.instance)
         self.steps, self._reached = 0, 0
-        spaces: dict[str, gymnasium.Space[Any]] = {"observation.state": gymnasium.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)}
+        spaces: dict[str, gymnasium.Space[Any]] = {"state": gymnasium.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32)}
         for camera in self.cameras:
-            spaces[f"observation.images.{camera}"] = gymnasium.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
+            spaces[f"image_{camera}"] = gymnasium.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
         self.observation_space = gymnasium.spaces.Dict(spaces)  # type: ignore[assignment]
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 
@@ -204,6 +207,10 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
 
         return project(self.world.model, self.world.data, points, self._camera(camera), size)
 
+    def scene_digest(self) -> str:
+        """Digest of the loaded instance's scene, as it was set up."""
+        return self.world.scene_digest()
+
     def snapshot(self) -> EnvSnapshot:
         """The state now; `restore` goes on from it to the same bits."""
         return EnvSnapshot(self.world.snapshot(), self.steps, self._reached)
@@ -262,8 +269,8 @@ class TaskEnv(gymnasium.Env[dict[str, NDArray[Any]], NDArray[np.float32]]):
         return np.concatenate([world.grip_position, world.grip_rotation_vector(), world.finger_positions]).astype(np.float32)
 
     def _gym_observation(self) -> dict[str, NDArray[Any]]:
-        observation = self.observe(self.cameras, self.image_size)
-        return {key: value for key, value in observation.items() if key != "task"}
+        size = self.image_size
+        return {"state": self._state(), **{f"image_{camera}": self.image(camera, size, size) for camera in self.cameras}}
 
     def _info(self) -> dict[str, Any]:
         return {"instruction": self.instance.instruction, "instance": self.instance.key, "success": self.success, "subgoals": self.subgoal_fraction}

@@ -3,11 +3,14 @@
 So before a process forks (gymnasium's AsyncVectorEnv does, by default), all GL contexts of ours are closed and EGL is shut down, which ends its
 threads; parent and child make new contexts with their next image, which shows the same. Where that cannot be done, since OSMesa has no end, or
 somebody else's contexts are in use, the child is told instead of hanging.
+
+Others draw too, by MuJoCo's own modules, before anything of ours does; so forks are watched from when this module is imported.
 """
 
 import contextlib
 import gc
 import os
+import sys
 from typing import Any, Protocol
 from weakref import WeakSet
 
@@ -30,7 +33,7 @@ class _State:
 
     Attributes:
         holders: who has contexts.
-        backend: in use, or None where nothing was drawn.
+        backend: that ours draw with, or None where they have drawn nothing.
         left: what the parent could not shut down before it forked, or None.
     """
 
@@ -38,17 +41,18 @@ class _State:
         self.holders: WeakSet[Holder] = WeakSet()
         self.backend: str | None = None
         self.left: str | None = None
-        self.watching = False
 
     def before(self) -> None:
         """In the parent, before it forks."""
-        if self.backend is None:
+        egl = getattr(sys.modules.get("mujoco.egl"), "EGL_DISPLAY", None)  # made when somebody imports the module
+        backend = self.backend or ("egl" if egl else "osmesa" if "mujoco.osmesa" in sys.modules and _foreign() else None)
+        if backend is None:
             return
-        self.left = self.backend
+        self.left = backend
         with contextlib.suppress(Exception):  # such as a context that another thread is drawing with: then it is left
             for holder in list(self.holders):
                 holder.close()
-            if self.backend == "egl" and not _foreign():
+            if backend == "egl" and not _foreign():
                 _end_egl()
                 self.backend = self.left = None
 
@@ -62,6 +66,7 @@ class _State:
 
 
 _state = _State()
+os.register_at_fork(before=_state.before, after_in_child=_state.in_child, after_in_parent=_state.in_parent)
 
 
 def drawing(backend: str) -> None:
@@ -76,9 +81,6 @@ def drawing(backend: str) -> None:
             "afresh, by multiprocessing's 'spawn' (gymnasium.make_vec(..., vector_kwargs={'context': 'spawn'})), or draw nothing before"
         )
     _state.backend = backend
-    if not _state.watching:
-        _state.watching = True
-        os.register_at_fork(before=_state.before, after_in_child=_state.in_child, after_in_parent=_state.in_parent)
 
 
 def holds(holder: Holder) -> None:

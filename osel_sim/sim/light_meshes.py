@@ -60,39 +60,51 @@ def lighten(spec: Any, xml: str, how: LightMeshes) -> None:
 
 
 def _make(model: Any, how: LightMeshes) -> dict[str, NDArray[Any]]:
-    import fast_simplification
-
     light: dict[str, NDArray[Any]] = {}
     for i, name in _heavy(model, how.fewest).items():
-        vertices, faces = _weld(_vertices(model, i), _faces(model, i))
-        target = min(max(how.fewest, int(len(faces) * how.keep)), how.most)
-        points, triangles = fast_simplification.simplify(vertices.astype(np.float32), faces, target_count=target)
-        for cell in how.join:
-            if len(triangles) <= how.most:
-                break
-            # Made of loose pieces, which no decimation joins.
-            points, triangles = _join(vertices, faces, cell)
-            if len(triangles) > target:
-                points, triangles = fast_simplification.simplify(points, triangles, target_count=target)
+        points, triangles = decimated(model, i, how)
         if len(triangles) >= 4:
-            light[f"{name}.vertices"] = points.astype(np.float32)
-            light[f"{name}.faces"] = triangles.astype(np.int32)
+            light[f"{name}.vertices"] = points
+            light[f"{name}.faces"] = triangles
     return light
+
+
+def decimated(model: Any, i: int, how: LightMeshes) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """A light version of mesh `i` of a model: vertices (V, 3) as they were in its file, and triangles (F, 3)."""
+    import fast_simplification
+
+    vertices, faces = _weld(_vertices(model, i), _faces(model, i))
+    target = min(max(how.fewest, int(len(faces) * how.keep)), how.most)
+    points, triangles = fast_simplification.simplify(vertices.astype(np.float32), faces, target_count=target)
+    for cell in how.join:
+        if len(triangles) <= how.most:
+            break
+        # Made of loose pieces, which no decimation joins.
+        points, triangles = _join(vertices, faces, cell)
+        if len(triangles) > target:
+            points, triangles = fast_simplification.simplify(points, triangles, target_count=target)
+    return points.astype(np.float32), triangles.astype(np.int32)
+
+
+def textured(model: Any) -> set[int]:
+    """Meshes that are shown with a flat texture, which needs the mesh's own coordinates: decimation loses them. Cube textures do without."""
+    import mujoco
+
+    found = set[int]()
+    for geom in range(model.ngeom):
+        material = model.geom_matid[geom]
+        textures = model.mat_texid[material] if material >= 0 else np.array([-1])
+        if any(model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D for texture in textures[textures >= 0]):
+            found.add(int(model.geom_dataid[geom]))
+    return found
 
 
 def _heavy(model: Any, fewest: int) -> dict[int, str]:
     """Meshes with many faces that geoms show, none of them with a flat texture -> name of the light one: its own where no geom collides with it."""
-    import mujoco
-
-    shown, colliding, textured = set[int](), set[int](), set[int]()
+    shown, colliding, flat = set[int](), set[int](), textured(model)
     for geom in range(model.ngeom):
-        material = model.geom_matid[geom]
-        textures = model.mat_texid[material] if material >= 0 else np.array([-1])
-        # Flat textures need the mesh's own coordinates, which decimation loses; cube textures do without.
-        if any(model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_2D for texture in textures[textures >= 0]):
-            textured.add(int(model.geom_dataid[geom]))
         (colliding if model.geom_contype[geom] or model.geom_conaffinity[geom] else shown).add(int(model.geom_dataid[geom]))
-    names = {i: model.mesh(i).name for i in range(model.nmesh) if i not in textured and model.mesh_facenum[i] > fewest}
+    names = {i: model.mesh(i).name for i in range(model.nmesh) if i not in flat and model.mesh_facenum[i] > fewest}
     beside = {i: name + SHOWN for i, name in names.items() if i in shown & colliding and name.startswith(ROBOT)}
     return {i: name for i, name in names.items() if i not in colliding} | beside
 

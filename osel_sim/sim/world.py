@@ -11,6 +11,7 @@ from osel_sim.core.errors import ContentError, UsageError
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.sim.appearance import Appearance
 from osel_sim.sim.control import Control
+from osel_sim.sim.fingerprint import Fingerprint
 from osel_sim.sim.instance import Instance
 from osel_sim.sim.robots import load_robot
 from osel_sim.sim.scene import TABLE_HEIGHT, build_scene
@@ -50,6 +51,7 @@ class World:
         self._start_heights: dict[str, float] = {}
         self._find()
         self.appearance = Appearance(self.model, self.scene.root_bodies, self.scene.cameras)
+        self._fingerprint, self._set_up = Fingerprint(self.model), self.data.qpos.copy()
 
     # -- what is where -------------------------------------------------------------------------------------------------
 
@@ -203,6 +205,7 @@ class World:
             if name in self._parts:
                 address, low, high = self._parts[name]
                 data.qpos[address] = low + placement.opening * (high - low)
+        self._set_up = data.qpos.copy()
         mujoco.mj_step1(model, data)
         hold = np.zeros(7)
         hold[6] = -1.0
@@ -213,6 +216,10 @@ class World:
     def step(self, action: NDArray[Any]) -> None:
         """One control step (50 ms) of a 7-d OSC_POSE action in [-1, 1]."""
         self._control.step(action)
+
+    def scene_digest(self) -> str:
+        """What tells the scene that was loaded from others: all that is there, where and how it was put, its looks and the instruction."""
+        return self._fingerprint.of(self._set_up, self.instance.instruction)
 
     def snapshot(self) -> Snapshot:
         """The state now; `restore` goes on from it to the same bits."""

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.environment import EnvironmentSpec, Image
-from osel_sim.interface.instance import Instance
+from osel_sim.interface.instance import Instance, SeededInstance
 from osel_sim.interface.policy import Actions, Observation
+
+
+@dataclass(frozen=True)
+class PlainInstance(SeededInstance):
+    """An instance that can be sent to another process.
+
+    Attributes:
+        details: what else fixes it, as plain data: numbers, texts, lists and maps of such.
+    """
+
+    details: Mapping[str, Any] = field(default_factory=dict)
 
 
 class BaseEnvironment(ABC):

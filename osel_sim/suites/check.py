@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from osel_sim.core.errors import OselError
-from osel_sim.interface.environment import Environment, HasExpert
+from osel_sim.interface.environment import Environment, HasExpert, TellsScene
 from osel_sim.interface.suite import Task
 
 STEPS = 12
@@ -41,6 +41,8 @@ def check_task(task: Task, seed: int = 0) -> None:
         _hold(
             _play(env, task, seed) == first, f"{instance.key}: the same actions led elsewhere the second time: load must forget all that was before"
         )
+        if isinstance(env, TellsScene):
+            _check_scenes(env, env, task, seed)
         if spec.snapshots:
             _check_snapshot(env, task, seed)
 
@@ -84,6 +86,16 @@ def _actions(env: Environment, seed: int) -> Any:
     _hold(hold.shape == (spec.dimension,) and np.array_equal(spec.clip(hold), hold), f"hold_action must be an action, got {hold}")
     while True:
         yield spec.clip(spec.middle + spec.half_range * random.uniform(-1, 1, spec.dimension))
+
+
+def _check_scenes(env: Environment, teller: TellsScene, task: Task, seed: int) -> None:
+    told = []
+    for number in (seed, seed + 1, seed):
+        env.load(task.instance(number))
+        told.append(teller.scene_digest())
+    first, other, again = told
+    _hold(isinstance(first, str) and first != "", f"{task.name}: a scene's digest must be text that is not empty, got {first!r}")
+    _hold(first == again and first != other, f"{task.name}: a scene's digest must tell the instances of two seeds apart, and nothing else: {told}")
 
 
 def _check_snapshot(env: Environment, task: Task, seed: int) -> None:

@@ -6,6 +6,7 @@ from typing import Any
 from osel_sim.core import content
 from osel_sim.formats.run_config import environment
 from osel_sim.interface.suite import Task
+from osel_sim.suites.environments import environment as suite_environment
 
 
 def ran_with(tasks: Iterable[Task]) -> dict[str, Any]:
@@ -16,6 +17,12 @@ def ran_with(tasks: Iterable[Task]) -> dict[str, Any]:
     """
     from osel_sim.sim.gl import choose_backend
 
-    suites = [task.suite.spec for task in tasks]
+    suites = {task.suite.spec.name: task.suite.spec for task in tasks}.values()
     backend = choose_backend() if any(suite.opengl for suite in suites) else "none"
-    return environment(backend, content.root(), sorted({package for suite in suites for package in suite.packages}))
+    beside_us = sorted({package for suite in suites if not suite.environments for package in suite.packages})
+    found = environment(backend, content.root(), beside_us)
+    for suite in suites:
+        for place in suite.environments:
+            own = suite_environment(place).versions(suite.packages)
+            found["versions"] |= {f"{place}/{package}": version for package, version in own.items()}
+    return found

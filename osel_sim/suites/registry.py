@@ -11,7 +11,7 @@ from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.instance import SUITE_SEPARATOR
-from osel_sim.interface.suite import OURS, Suite, Task
+from osel_sim.interface.suite import OURS, Suite, TakesFolder, Task
 from osel_sim.suites import SUITES
 
 ALL, TAG = "all", "tag"
@@ -24,7 +24,7 @@ def load_suite(name: str, folder: Path | None = None, robot: str | None = None) 
     """A suite by name.
 
     Args:
-        folder: task files of the user's own, for our suite.
+        folder: task files of the user's own: for our suite, and in a folder called as it is for a suite that takes some.
         robot: that does all tasks of our suite; None: each task's own.
 
     Raises:
@@ -47,6 +47,8 @@ def load_suite(name: str, folder: Path | None = None, robot: str | None = None) 
         raise UsageError(f"suite {name!r}: {SUITES.locations()[name]} makes no suite ({type(error).__name__}: {error})") from error
     if found != name:
         raise UsageError(f"suite {name!r}: {SUITES.locations()[name]} makes one that calls itself {found!r}")
+    if folder is not None and isinstance(suite, TakesFolder) and (folder / name).is_dir():
+        return suite.with_files(folder / name)
     return suite
 
 

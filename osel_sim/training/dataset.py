@@ -22,6 +22,7 @@ from osel_sim.formats.dataset_mapping import DatasetMapping
 from osel_sim.ingestion.lerobot_check import INFO, open_dataset
 from osel_sim.ingestion.lerobot_files import DatasetFiles
 from osel_sim.ingestion.lerobot_numbers import actions, states
+from osel_sim.policy.mapping import turned_over
 from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations
 
 DECODE_ROWS = 512
@@ -78,7 +79,7 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
     return Demonstrations(
         folder=folder,
         fingerprint=fingerprint,
-        images={camera: _images(files, camera, mapping.camera(camera), fingerprint, progress) for camera in cameras},
+        images={camera: _images(files, camera, mapping, fingerprint, progress) for camera in cameras},
         state=state,
         action=action,
         task=files.task,
@@ -121,7 +122,7 @@ def _fingerprint(folder: Path, files: Sequence[Path], mapping: DatasetMapping) -
     return content_digest((folder / INFO).read_bytes(), *(f"{name} {stat.st_size} {stat.st_mtime_ns}" for name, stat in stats), *told)[:16]
 
 
-def _images(files: DatasetFiles, camera: str, column: str, fingerprint: str, progress: bool) -> NDArray[np.uint8]:
+def _images(files: DatasetFiles, camera: str, mapping: DatasetMapping, fingerprint: str, progress: bool) -> NDArray[np.uint8]:
     """The decoded images of one camera, from the cache or into it."""
     cache = files.folder / ".cache"
     home = cache / fingerprint
@@ -132,22 +133,23 @@ def _images(files: DatasetFiles, camera: str, column: str, fingerprint: str, pro
                 shutil.rmtree(stale, ignore_errors=True)
         home.mkdir(parents=True, exist_ok=True)
         with atomic(target) as partial:
+            column = mapping.camera(camera)
             shape = files.image(column, 0).shape
             array = np.lib.format.open_memmap(partial, mode="w+", dtype=np.uint8, shape=(files.frames, *shape))
-            _decode(files, column, array, f"decoding {camera}", progress)
+            _decode(files, column, array, mapping.flip.get(camera), f"decoding {camera}", progress)
             array.flush()
             del array
     mapped: NDArray[np.uint8] = np.load(target, mmap_mode="r", allow_pickle=False)
     return mapped
 
 
-def _decode(files: DatasetFiles, column: str, out: NDArray[np.uint8], label: str, progress: bool) -> None:
+def _decode(files: DatasetFiles, column: str, out: NDArray[np.uint8], flip: str | None, label: str, progress: bool) -> None:
     def decode(position: int, cell: Any) -> None:
         image = files.decoded(cell, column, position)
         if image.shape != out.shape[1:]:
             size, first = (f"{shape[1]} x {shape[0]}" for shape in (image.shape, out.shape[1:]))
             raise DataError(f"{files.where(position, column)}: the image has {size} pixels, the first one {first}")
-        out[position] = image
+        out[position] = turned_over(image, flip)
 
     position = 0
     with ThreadPoolExecutor() as pool, progress_bar(len(out), "frame", label, quiet=not progress) as bar:

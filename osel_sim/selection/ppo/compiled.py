@@ -25,9 +25,9 @@ LINE = 16
 @functools.cache
 def prepare() -> None:
     """Compile what training takes, or load it from numba's cache, before anything waits for it."""
-    from osel_sim.selection.ppo.kernel import forward, log_softmax, train
+    from osel_sim.selection.ppo.kernel import GROUP, forward, log_softmax, train
 
-    sizes, batch = np.array([1, 2, 2], np.int64), 1
+    sizes, batch = np.array([1, 2, 2], np.int64), GROUP
     actor, critic = ((*(_aligned((10,)) for _ in range(3)), sizes) for _ in range(2))
     layers = (2, batch, 2)
     work = [_aligned(shape) for _ in range(2) for shape in ((2, *layers), (2, *layers), layers)]
@@ -82,21 +82,26 @@ class FastPPO:
         Returns:
             columns chosen, (T,).
         """
-        from osel_sim.selection.ppo.kernel import BLOCK, forward, log_softmax, train
-
         prepare()
+        with self._streams.in_use():
+            return self._run(contexts, rewards)
+
+    def _run(self, contexts: NDArray[np.float32], rewards: NDArray[np.float64]) -> NDArray[np.int16]:
+        from osel_sim.selection.ppo.kernel import GROUP, forward, log_softmax, train
+
         total, policies, size = len(contexts), rewards.shape[1], self._n_steps
+        batch = -(-size // GROUP) * GROUP
         chosen = np.zeros(total, np.int16)
         widest = int(max(self.actor[3][1:]))
 
         def buffers(tower: "Tower") -> list[NDArray[np.float32]]:
-            shape = (len(tower[3]) - 1, size, widest)
+            shape = (len(tower[3]) - 1, batch, widest)
             return [_aligned((2, *shape)), _aligned((2, *shape)), _aligned(shape)]
 
         actor, critic = buffers(self.actor), buffers(self.critic)
-        inputs, following = _aligned((size, contexts.shape[1])), _aligned((size, contexts.shape[1]))
+        inputs, following = _aligned((batch, contexts.shape[1])), _aligned((batch, contexts.shape[1]))
         following[: min(size, total)] = contexts[:size]
-        room = _aligned((max(BLOCK, widest, contexts.shape[1]),))
+        room = _aligned((max(widest, contexts.shape[1]),))
         ready = False
         for start in range(0, total, size):
             inputs, following = following, inputs
@@ -106,13 +111,13 @@ class FastPPO:
                 forward(self.critic[0], self.critic[3], inputs, critic[0], self._gelu)
             log_probabilities = np.empty((count, policies))
             log_softmax(actor[0][0, -1], log_probabilities)
-            actions = self._draw(log_probabilities)
+            actions = _draw(log_probabilities)
             chosen[start : start + count] = actions
             if count < size:
                 break
             rows = np.arange(size)
             received = rewards[start + rows, actions].astype(np.float32)
-            values = critic[0][0, -1, :, 0].copy()
+            values = critic[0][0, -1, :size, 0].copy()
             advantages = received - values
             returns = advantages + values
             normalised = (advantages - advantages.mean()) / (advantages.std(ddof=1) + np.float32(1e-8))
@@ -128,14 +133,13 @@ class FastPPO:
                 critic[0], critic[1] = critic[1], critic[0]
         return chosen
 
-    def _draw(self, log_probabilities: NDArray[np.float64]) -> NDArray[np.int64]:
-        """One policy a row, by the call that SB3's categorical distribution makes, so that the same stream gives the same draws."""
-        import torch
 
-        probabilities = torch.from_numpy(np.exp(log_probabilities).astype(np.float32))
-        with self._streams.in_use():
-            drawn = [torch.multinomial(row[None], 1, True) for row in probabilities]
-        return torch.cat(drawn).reshape(-1).numpy()
+def _draw(log_probabilities: NDArray[np.float64]) -> NDArray[np.int64]:
+    """One policy a row, by the call that SB3's categorical distribution makes, so that the same stream gives the same draws."""
+    import torch
+
+    probabilities = torch.from_numpy(np.exp(log_probabilities).astype(np.float32))
+    return torch.cat([torch.multinomial(row[None], 1, True) for row in probabilities]).reshape(-1).numpy()
 
 
 Tower = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32], NDArray[np.int64]]

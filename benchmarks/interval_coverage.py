@@ -1,6 +1,6 @@
 """How often the intervals of off-policy estimates hold the truth, by how many effective decisions they rest on.
 
-    python benchmarks/coverage.py [--runs 100] [--decisions 1000]
+    python benchmarks/interval_coverage.py [--runs 100] [--decisions 1000]
 
 A simulated run: two policies, each good in one of two kinds of contexts, chosen between by `auto` (with its floor, and with a higher one),
 `thompson`, `lints` and `random`. From its propensities three targets are estimated: always the first policy, both equally often, and the better one

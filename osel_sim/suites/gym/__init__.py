@@ -1,0 +1,1 @@
+"""Any gymnasium environment whose info says whether the task is done."""

@@ -1,0 +1,1 @@
+"""Environments that LeRobot's own configuration makes (huggingface/lerobot)."""
