@@ -260,11 +260,12 @@ class BayesianSelector(SelectorBase):
         rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
         left = targets - heads @ self._guess - (rows * self._regression.weights[chosen]).sum(axis=1)
         left /= math.sqrt(self._regression.noise)
-        own = np.zeros((len(chosen), len(self._counts)))
-        own[np.arange(len(chosen)), chosen] = 1.0
-        counts, sums = np.cumsum(own, axis=0), np.cumsum(own * left[:, None], axis=0)
-        before = _evidence(counts[starts - 1], sums[starts - 1])
-        after = _evidence(counts[-1] - counts[starts - 1], sums[-1] - sums[starts - 1])
+        piece = np.searchsorted(starts, np.arange(len(chosen)), side="right")
+        counts, sums = np.zeros((2, PIECES, len(self._counts)))
+        np.add.at(counts, (piece, chosen), 1.0)
+        np.add.at(sums, (piece, chosen), left)
+        counts, sums = counts.cumsum(axis=0), sums.cumsum(axis=0)
+        before, after = _evidence(counts[:-1], sums[:-1]), _evidence(counts[-1] - counts[:-1], sums[-1] - sums[:-1])
         ahead = before + after - _evidence(counts[-1:], sums[-1:])
         most = float(ahead.max())
         return int(starts[ahead.argmax()]) if most + math.log(np.exp(ahead - most).mean()) > math.log(self._prior.alarm) else 0
