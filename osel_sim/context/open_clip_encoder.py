@@ -118,7 +118,8 @@ class OpenClipEncoder:
 
     def embed_text(self, text: str) -> NDArray[np.float32]:
         """Embedding (d/2,) of length one."""
-        return self.embed_texts([text])[0]
+        embedding: NDArray[np.float32] = self.embed_texts([text])[0]
+        return embedding
 
     def embed_texts(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """Embeddings (n, d/2) of length one, in one batch."""

@@ -84,7 +84,8 @@ class SentenceEncoder:
 
     def encode(self, images: Sequence[Image], instruction: str) -> Context:
         """Context (d,) float32 of length one; what does not fit into the model's window is cut off."""
-        return self.encode_texts([instruction])[0]
+        context: Context = self.encode_texts([instruction])[0]
+        return context
 
     def encode_texts(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """Contexts (n, d) of texts, in one batch."""

@@ -96,8 +96,9 @@ class Prior:
         """How it explores and what it considers, as JSON values."""
         lists = {"signals": [float(value) for value in self.signals], "shared": [float(value) for value in self.shared]}
         parts = {"parts": list(self.parts)} if self.parts else {}
-        parts |= {"alarm": float(self.alarm)} if math.isfinite(self.alarm) else {}
-        return {**lists, **{name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}, **parts}
+        alarm = {"alarm": float(self.alarm)} if math.isfinite(self.alarm) else {}
+        weights = {name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}
+        return {**lists, **weights, **parts, **alarm}
 
 
 class BayesianSelector(SelectorBase):
