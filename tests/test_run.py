@@ -111,7 +111,7 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
         process.send_signal(signal.SIGKILL)
         process.wait()
         process.stderr.close()
-        assert wait_until(lambda started=started: not any(map(alive, started)), 20)  # what shows the run among them
+        assert wait_until(lambda started=started: not any(map(alive, started)), 60)  # what shows the run among them
     assert run_page(folder).title.endswith(f" over {len(read_journal(folder / 'episodes.jsonl'))} decisions")
     assert len(read_journal(folder / "episodes.jsonl")) < EPISODES
     assert user(world, *arguments, "--resume", "--no-page") == 0
