@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -15,7 +16,7 @@ from run_helpers import HORIZON, children, command, environment, execute, make_w
 from synthetic_log import make_row, write_log
 
 from osel_sim.analysis.live import read_live
-from osel_sim.formats.journal import read_journal
+from osel_sim.formats.journal import read_journal, to_line
 from osel_sim.reporting.run_page import run_page
 from osel_sim.run import main as run_main
 from osel_sim.selection.state import load_state
@@ -64,6 +65,7 @@ def test_what_a_run_writes_and_prints(world, reference):
     assert remote, "the untrained selector explores"
     assert all(decision.seconds.upload > 0 and decision.price > 0 and decision.actions < HORIZON for decision in remote)
     assert len((folder / "timing.jsonl").read_text().splitlines()) == EPISODES
+    assert len({decision.scene for decision in decisions} - {None}) == EPISODES
 
 
 def test_summary_agrees_with_the_journal(reference):
@@ -99,7 +101,7 @@ def test_run_json_holds_what_the_run_depends_on(reference):
 def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference, trial):
     chance = random.Random(trial)
     folder = world / f"killed-{trial}"
-    arguments = ["--episodes", EPISODES, "--counterfactual", "--out", folder]
+    arguments = ["--episodes", EPISODES if trial else EPISODES - 1, "--counterfactual", "--out", folder]
     for attempt in range(1 + trial):
         flags = ["--resume"] if attempt else ["--video", "2", *(["--view"] if trial else [])]
         process = subprocess.Popen(
@@ -114,9 +116,31 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
         assert wait_until(lambda started=started: not any(map(alive, started)), 60)  # what shows the run among them
     assert run_page(folder).title.endswith(f" over {len(read_journal(folder / 'episodes.jsonl'))} decisions")
     assert len(read_journal(folder / "episodes.jsonl")) < EPISODES
-    assert user(world, *arguments, "--resume", "--no-page") == 0
+    if trial:
+        assert user(world, *arguments, "--resume", "--no-page") == 0
+    else:  # the settings are those that it began with, and there may be more decisions
+        assert run_main(["--out", str(folder), "--resume", "--episodes", str(EPISODES), "--no-page"]) == 0
+    assert json.loads((folder / "run.json").read_text())["configuration"]["episodes"] == EPISODES
     assert not (folder / "report.html").exists()
     assert bytes_of(folder) == bytes_of(reference[0])
+
+
+@pytest.mark.slow
+def test_a_journal_begun_without_scenes_goes_on_without(world, reference):
+    folder = world / "older"
+    shutil.copytree(reference[0], folder)
+
+    def without(lines: list[str]) -> bytes:
+        return "".join(to_line({key: value for key, value in json.loads(line).items() if key != "scene"}) for line in lines).encode()
+
+    lines = (folder / "episodes.jsonl").read_text().splitlines()
+    for name in ("timing.jsonl", "counterfactual.jsonl"):
+        (folder / name).write_text("".join((folder / name).read_text().splitlines(keepends=True)[:3]))
+    (folder / "episodes.jsonl").write_bytes(without(lines[:3]))
+    (folder / "summary.json").unlink()
+    done = execute(world, "run", "--episodes", EPISODES, "--counterfactual", "--out", folder, "--resume", "--no-page")
+    assert done.returncode == 0, done.stderr
+    assert (folder / "episodes.jsonl").read_bytes() == without(lines)
 
 
 def test_noise_on_actions_reaches_the_robot(tmp_path):
@@ -162,7 +186,7 @@ def test_ctrl_c_ends_with_what_there_is(world):
     assert summary["decisions"] == len(read_journal(folder / "episodes.jsonl")) >= 2
     assert "random" in output
     (name, config), *_ = next_commands(output)  # goes on with it
-    assert name == "run" and config.resume and config.folder == folder and config.episodes == 500
+    assert name == "run" and config.resume and config.out == folder and not config.task  # which run.json says
 
 
 def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):
@@ -172,6 +196,7 @@ def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):
         (["--alpha-price", "1"], "reward.alpha_price"),
         (["--selector", "random"], "selector"),
         (["--robot", "UR5e"], "robot"),
+        (["--episodes", "5"], "episodes"),
     ):
         assert user(world, "--episodes", EPISODES, "--counterfactual", "--out", folder, "--resume", *flags) == 2
         assert f"{key} was" in one_line(capsys)

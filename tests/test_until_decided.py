@@ -16,6 +16,7 @@ from test_record import files, resume
 import osel_sim as osel
 from osel_sim.analysis.log import read_outcomes
 from osel_sim.analysis.until_decided import UntilDecided, seeds_a_look
+from osel_sim.api.record import RecordConfig, _check_stopping
 from osel_sim.core.errors import DataError, SettingError, UsageError
 from osel_sim.episodes.workers import Plan, make_row
 from osel_sim.formats import library
@@ -73,7 +74,7 @@ def test_it_stops_where_compare_has_an_answer_and_not_before(plan, tmp_path, rat
     found = osel.compare(kept_log(tmp_path / "log", plan, rows, stop.kept), margin=margin)
     assert found.decision == decision and found.result["pairs"][0]["looks"] == len(stop.kept) // 12
     assert "at any time" in found.result["pairs"][0]["test"]["method"]
-    before = frozenset(key for key in stop.order[: len(stop.kept) - 12])
+    before = frozenset(stop.order[: len(stop.kept) - 12])
     earlier = osel.compare(kept_log(tmp_path / "before", plan, rows, before), margin=margin) if before else None
     assert earlier is None or (earlier.decision == "not enough data" and "more instances would tell" in earlier.verdict)
 
@@ -86,7 +87,7 @@ def test_it_goes_on_where_no_answer_is_there(plan, tmp_path):
 
 
 def test_rounds_have_all_tasks_and_levels_alike():
-    assert [seeds_a_look(*sizes) for sizes in ((1, 1), (1, 2), (3, 2), (11, 2), (1, 4), (10, 1))] == [10, 10, 4, 2, 12, 1]
+    assert [seeds_a_look(*sizes) for sizes in ((1, 1), (1, 2), (3, 2), (11, 2), (1, 4), (10, 1))] == [10, 10, 4, 4, 12, 4]
 
 
 def test_a_baseline_is_compared_with_by_instance_and_scene(plan, tmp_path):
@@ -132,6 +133,8 @@ def test_wrong_settings_are_named(tmp_path):
     ):
         with pytest.raises(SettingError, match=message):
             osel.record(task="lift", policies="local_small", out=tmp_path / "out", **values)
+    assert RecordConfig.of(task="lift", out=tmp_path).to_json().keys() >= {"margin", "until_decided", "baseline"}
+    _check_stopping(RecordConfig.of(**RecordConfig.of(task="lift", out=tmp_path).to_json()))  # of a run.json
     both = [row for policy in ("a", "b") for row in _rows(policy, 3)]
     with pytest.raises(SettingError, match="has several policies, a, b"):
         osel.record(
