@@ -71,7 +71,7 @@ def test_the_command_reports_every_area_and_its_exit_code_agrees(tmp_path: Path)
     done = subprocess.run([sys.executable, "-m", "osel_sim.doctor", "--json"], capture_output=True, text=True, cwd=tmp_path)
     report = json.loads(done.stdout)
     checks = [Check(**check) for check in report["checks"]]
-    assert {check.area for check in checks} == {"python", "packages", "display", "machine", "tasks", "policies", "encoder"}
+    assert {check.area for check in checks} == {"python", "packages", "display", "machine", "tasks", "suites", "policies", "encoder"}
     assert {check.state for check in checks} <= {"ok", "note", "missing"}
     assert all(check.fix for check in checks if check.state == "missing")
     assert report["ready"] == all(check.state != "missing" for check in checks)
