@@ -17,11 +17,14 @@ Writes report.html, one file that needs no network, with figures/*.png, figures/
 
 def _execute(config: ReportConfig) -> int:
     from osel_sim.api.report import report, watch
+    from osel_sim.core.shown import shown
 
     if config.watch:
         watch(config, lambda url: print(f"{url} shows {config.folder} as it grows", flush=True))
         return 0
-    page = report(config).page
+    result = report(config)
+    page = result.page
+    print(shown(result.verdict))
     print(f"written to {page}")
     if not config.open:
         print(f"next: open {page.resolve().as_uri()} in a browser, or give --open")

@@ -16,7 +16,8 @@ EXAMPLES = """examples:
   python -m osel_sim.run --task tag:short --level 0 2 --episodes 200       # several tasks and levels, mixed
   python -m osel_sim.run --task all --level 0 2 --selector auto --encoder osel_suite --warm-start assets/logs/suite   # it has seen a log's outcomes
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
-  python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first --resume
+  python -m osel_sim.run --out runs/first --resume                         # goes on with it, if it was cut off
+  python -m osel_sim.run --out runs/first --resume --episodes 200          # and on, to more decisions
   python -m osel_sim.run --config runs/first/run.json --seed 1 --out runs/second   # another run with the same settings
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
@@ -27,11 +28,13 @@ Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 def _execute(config: RunConfig) -> int:
     from osel_sim.api.run import run
     from osel_sim.cli.causes import print_causes
-    from osel_sim.cli.console import console, run_table
+    from osel_sim.cli.console import console, plain, run_table
 
     result = run(config)
     if result.journal:
         console().print(run_table(dict(result.summary)))
+        if result.verdict:
+            console().print(plain(result.verdict, "bold"), soft_wrap=True)
         print_causes((decision.policy, f"decision {decision.index}", decision.error) for decision in result.journal if decision.error)
         print(f"written to {result.folder}" + (f"; {result.page} shows it" if result.page else ""))
     _print_next(config, result)
@@ -45,7 +48,7 @@ def _print_next(config: RunConfig, result: "RunResult") -> None:
 
     folder, steps = result.folder, list[Step]()
     if result.interrupted:
-        steps.append(("goes on with it", "run", ["--config", folder / RUN, "--resume"]))
+        steps.append(("goes on with it", "run", ["--out", folder, "--resume"]))
     elif result.journal:
         steps.append(("shows its page", "report", [folder, "--open"]))
         steps.append(("estimates what other choices would have earned", "replay", [folder]))

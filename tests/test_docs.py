@@ -7,14 +7,13 @@ import re
 import shlex
 import tomllib
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 
 import pytest
+from test_cli import commands_of
 
 from osel_sim.__main__ import COMMANDS
 from osel_sim.api.run import RunConfig
-from osel_sim.cli import suites_command
 from osel_sim.cli.command import Command, read_settings
 from osel_sim.core import content
 from osel_sim.formats.dataset_mapping import load_dataset_mapping
@@ -130,14 +129,6 @@ def calls() -> dict[str, tuple[str, str]]:
     return {place: call for place, call in found.items() if not call[0].isupper()}
 
 
-def commands_of(name: str) -> list[Command]:
-    """The command of that name; `train` is two, and so is `suites`."""
-    if name == "suites":
-        return list(suites_command.commands.values())
-    module = import_module(f"osel_sim.{name}")
-    return [module.main] if isinstance(module.main, Command) else [module.policy_command, module.encoder_command]
-
-
 def words_of(text: str) -> list[str]:
     """Arguments, without what is said beside them."""
     text = re.split(r"\\?\||&&|;| {3,}(?=[^-#\s])", text)[0]
@@ -169,10 +160,8 @@ def test_command_lines_have_flags_that_exist(
     words = words_of(rest)
     if not words:
         return
-    if name == "suites":
-        command, words = suites_command.commands[words[0]], words[1:]
-    else:
-        command = commands_of(name)[-1 if any(word.startswith("--encoder") for word in words) else 0]
+    other = words.pop(0) == "install" if name == "suites" else any(word.startswith("--encoder") for word in words)
+    command = commands_of(name)[-1 if other else 0]
     if "--config" in words:
         Path("settings.toml").write_text("")
         words[words.index("--config") + 1] = "settings.toml"

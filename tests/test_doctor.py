@@ -10,6 +10,7 @@ from safetensors.numpy import save_file
 from osel_sim.cli import machine_checks
 from osel_sim.cli.machine_checks import Check
 from osel_sim.core import content
+from osel_sim.doctor import main as doctor_main
 
 
 def checkpoint(folder: Path) -> Path:
@@ -86,12 +87,11 @@ def test_without_opengl_it_names_the_packages(monkeypatch: pytest.MonkeyPatch) -
     assert "known: egl, osmesa, glfw" in found.found + found.fix
 
 
-def test_the_table_says_what_to_do(tmp_path: Path) -> None:
+def test_the_table_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.toml").write_text("version = 1\n")
-    command = [sys.executable, "-m", "osel_sim.doctor", "--policies-dir", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "correct mine.toml" in done.stdout
-    *_, summary, following = done.stdout.splitlines()
+    assert doctor_main(["--policies-dir", str(tmp_path)]) == 1
+    told = capsys.readouterr().out
+    assert "correct mine.toml" in told
+    *_, summary, following = told.splitlines()
     assert "missing" in summary
     assert f"-m osel_sim.doctor --policies-dir {tmp_path} " in following

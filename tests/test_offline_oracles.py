@@ -9,13 +9,12 @@ from synthetic_log import clusters, make_row, write_log
 
 from osel_sim.analysis.gains import Gain, gain_of
 from osel_sim.analysis.log import LoggedInstance, LoggedOutcomes, read_log
-from osel_sim.analysis.measures import Curves, gap_closed
+from osel_sim.analysis.measures import Curves, difference_ends, gap_closed
 from osel_sim.analysis.oracles import expected_oracle, oracles
 from osel_sim.analysis.streams import complete_instances, draw_streams
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.statistics.betting import advantage_bounds
-from osel_sim.statistics.intervals import RESAMPLES
 
 FREE = RewardWeights(0.0, 0.0)
 
@@ -56,7 +55,7 @@ def test_repeats_on_a_tenth_stand_for_all():
         some = np.where((generator.random(6000) < 0.1)[:, None, None] | (np.arange(4) == 0), rewards, np.nan)
         for name, reference in references.items():
             value, gains = expected_oracle(some, reference)
-            estimates[name].append((value.mean(), gains.std() / len(gains) ** 0.5))
+            estimates[name].append((value.mean(), np.nanstd(gains) / np.isfinite(gains).sum() ** 0.5))
     spread = {}
     for name, found in estimates.items():
         means, errors = np.transpose(found)
@@ -67,15 +66,16 @@ def test_repeats_on_a_tenth_stand_for_all():
 
 
 def test_the_interval_of_the_gap_closed_counts_what_the_oracle_may_be_off():
-    flat = np.zeros((5, 40))
+    flat, order = np.zeros((5, 40)), np.tile(np.arange(40, dtype=np.int32), (5, 1))
     gains = {"expected": Gain(1.0, 0.1)}
-    sure = Curves({"x": flat + 0.5}, {"best_single": flat, "expected": flat + 1.0}, "expected", 30, np.zeros(RESAMPLES), gains, {})
-    unsure = replace(sure, expected_errors=np.random.default_rng(0).normal(0.0, 0.1, RESAMPLES))
+    known = {"best_single": flat, "expected": flat + 1.0}
+    sure = Curves({"x": flat + 0.5}, known, "expected", order, np.arange(40), 0.0, gains, {})
+    unsure = replace(sure, expected_error=0.1)
     assert gap_closed(sure.selectors["x"], sure, "expected", 0) == (0.5, (0.5, 0.5))
     share, (low, high) = gap_closed(unsure.selectors["x"], unsure, "expected", 0)
-    assert share == 0.5 and (low, high) == pytest.approx((0.5 / 1.196, 0.5 / 0.804), rel=0.02)
-    assert unsure.interval("expected", flat + 1.0) == pytest.approx((0.804, 1.196), rel=0.02)
-    assert unsure.interval("best_single", flat) == (0.0, 0.0)
+    assert share == 0.5 and (low, high) == pytest.approx((0.4, 0.6), abs=0.003)  # two standard errors of the gap, of which it is half
+    assert difference_ends(unsure, "expected", flat + 1.0) == pytest.approx((0.8, 1.2), abs=0.005)
+    assert difference_ends(unsure, "best_single", flat) == [0.0, 0.0]
 
 
 def test_groups_that_tell_nothing_are_not_used(tmp_path: Path):
@@ -127,7 +127,7 @@ def test_what_tells_nothing_gains_nothing():
         log = made(generator.normal(size=(400, (8, 64)[seed % 2])), generator, rates, target=generator.integers(9, size=400))
         means = log.mean_rewards(FREE)
         found = oracles(log, FREE)
-        gain = gain_of(np.arange(400, dtype=np.int32)[None], (found.predictable - means[:, found.best_single])[None])
+        gain = gain_of(np.arange(400, dtype=np.int32)[None], (found.predictable - means[:, found.best_single])[None], np.arange(400))
         apart.append(gain.mean)
         beyond += gain.beyond_error()
     assert beyond <= 1 and -0.015 < np.mean(apart) <= 0.005

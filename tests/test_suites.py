@@ -169,6 +169,15 @@ def test_a_suite_that_forgets_nothing_is_found_out(monkeypatch):
         check_task(find_task("toy:reach"))
 
 
+@pytest.mark.parametrize(("told", "message"), [(lambda env: "same", "must tell the instances of two seeds apart"), (lambda env: "", "not empty")])
+def test_a_scene_that_is_not_told_from_others_is_found_out(monkeypatch, told, message):
+    import toy_suite
+
+    monkeypatch.setattr(toy_suite.ReachEnvironment, "scene_digest", told, raising=False)
+    with pytest.raises(SuiteError, match=message):
+        check_task(find_task("toy:reach"))
+
+
 def test_a_state_of_another_size_than_promised_is_refused(monkeypatch):
     import toy_suite
 

@@ -50,6 +50,11 @@ def compare(contenders: Sequence[Contender], weights: RewardWeights, margin: flo
     }
 
 
+def compare_pairs(pairs: Pairs, margin: float, power: float = 0.8) -> dict[str, Any]:
+    """Two policies alone, as an entry of `pairs` in `compare.json`."""
+    return _compared(pairs, _probability(pairs), 1, margin, power)
+
+
 def plan(contenders: Sequence[Contender], weights: RewardWeights, detect: float, margin: float, power: float = 0.8) -> list[dict[str, Any]]:
     """Instances needed for each pair of policies, from how often one of the two solves what the other does not.
 

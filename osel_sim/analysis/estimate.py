@@ -1,12 +1,13 @@
 """A number with its 95% interval, and how to get one."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from osel_sim.statistics.intervals import bootstrap_mean_interval, bootstrap_means, effective_trials, wilson_interval
+from osel_sim.statistics.clustered import unit_mean
+from osel_sim.statistics.intervals import bootstrap_mean_interval, effective_trials, wilson_interval
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import Array
@@ -23,49 +24,48 @@ class Estimate:
     high: float
 
 
-def mean_of(values: ArrayLike) -> Estimate | None:
-    """Mean of what is not NaN with its bootstrap interval; None of nothing."""
+def mean_of(values: ArrayLike, units: "NDArray[np.int64] | None" = None) -> Estimate | None:
+    """Mean of what is not NaN with its interval; None of nothing.
+
+    Args:
+        values: (n,).
+        units: (n,) number of the unit that each is of, such as a scene that instances share; None: each is a unit. The interval is over units:
+            a bootstrap where each has one value, else that of a mean of clustered values.
+    """
     sample = np.asarray(values, np.float64).ravel()
-    sample = sample[np.isfinite(sample)]
-    if not sample.size:
+    known = np.isfinite(sample)
+    if not known.any():
         return None
+    if units is not None and len(set(units[known].tolist())) < known.sum():
+        found = unit_mean(np.bincount(units[known], weights=sample[known]), np.bincount(units[known]))
+        return Estimate(found.mean, *found.interval()) if found.units > 1 else Estimate(found.mean, found.mean, found.mean)
+    sample = sample[known]
     return Estimate(float(sample.mean()), *bootstrap_mean_interval(sample, resamples=RESAMPLES))
 
 
-def over_instances(values: "Array", instances: NDArray[Any]) -> Estimate | None:
-    """Mean of what is not NaN over seeds and decisions, with its bootstrap interval over instances; None of nothing.
-
-    Args:
-        values: (S, T) of S seeds, each of which showed instances in another order.
-        instances: (S, T), which instance was decided on.
-    """
-    known = np.isfinite(values)
-    if not known.any():
-        return None
-    low, high = np.quantile(instance_draws(values[known], instances[known], RESAMPLES), [0.025, 0.975])
-    return Estimate(float(values[known].mean()), float(low), float(high))
-
-
-def instance_draws(values: "Array", instances: NDArray[Any], resamples: int) -> "Array":
-    """Means of values (n,), the instances (n,) that they are of drawn anew, (resamples,)."""
-    _, at = np.unique(instances, return_inverse=True)
-    sums, counts = np.bincount(at.ravel(), values), np.bincount(at.ravel())
-    # The same seed draws the same instances for both.
-    return np.asarray(bootstrap_means(sums, resamples=resamples) / bootstrap_means(counts, resamples=resamples), np.float64)
-
-
-def rate_of(outcomes: "Array") -> Estimate | None:
+def rate_of(outcomes: "Array", units: "NDArray[np.int64] | None" = None) -> Estimate | None:
     """Share of successes among the outcomes (N, R) that are not NaN; None of nothing.
 
-    Wilson's interval, with as many trials as the repeats of an instance, which are no independent trials, are worth; with graded outcomes a bootstrap
-    over instances. The rate is that of the mean instance, so that one with more repeats does not weigh more.
+    Wilson's interval, with as many trials as the repeats of an instance, which are no independent trials, are worth; with graded outcomes that of a
+    mean. The rate is that of the mean instance, so that one with more repeats does not weigh more.
+
+    Args:
+        units: (N,) as in `mean_of`: instances of one unit are no independent trials either.
     """
-    known = outcomes[np.isfinite(outcomes).any(axis=-1)]
+    rows = np.isfinite(outcomes).any(axis=-1)
+    known = outcomes[rows]
     if not known.size:
         return None
     finite = np.isfinite(known)
     per_instance = np.nanmean(known, axis=-1)
     if not np.isin(known[finite], (0.0, 1.0)).all():
-        return mean_of(per_instance)
-    rate, trials = float(per_instance.mean()), effective_trials(per_instance, float(finite.sum()))
+        return mean_of(per_instance, None if units is None else units[rows])
+    rate, trials = float(per_instance.mean()), effective_trials(_per_unit(per_instance, None if units is None else units[rows]), float(finite.sum()))
     return Estimate(rate, *wilson_interval(min(rate * trials, trials), trials))
+
+
+def _per_unit(values: "Array", units: "NDArray[np.int64] | None") -> "Array":
+    if units is None:
+        return values
+    counts = np.bincount(units)
+    return np.asarray(np.bincount(units, weights=values)[counts > 0] / counts[counts > 0], np.float64)

@@ -1,4 +1,4 @@
-"""How much one way of choosing has over another, and whether that is more than chance. Judged over instances: others could have been drawn."""
+"""How much one way of choosing has over another, and whether that is more than chance. Judged over units: others could have been drawn."""
 
 import math
 from collections.abc import Mapping
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.log import Array
+from osel_sim.analysis.streamed import Units, over_units
 from osel_sim.statistics.intervals import Interval
 
 ERROR = 0.05
@@ -20,7 +21,7 @@ ROUNDING = 1e-12
 
 @dataclass(frozen=True)
 class Gain:
-    """Reward a decision, with its standard error over instances."""
+    """Reward a decision, with its standard error over units."""
 
     mean: float
     error: float
@@ -41,30 +42,30 @@ class Gain:
         return self.mean > max(_width(among) * self.error, ROUNDING)
 
 
-def gain_of(order: NDArray[np.int32], differences: Array, off: float = 0.0) -> Gain:
+def gain_of(order: NDArray[np.int32], differences: Array, units: Units, off: float = 0.0) -> Gain:
     """Mean of differences in reward.
 
     Args:
         order: (S, T) instance of every decision.
         differences: (S, T).
+        units: (N,) of the instances.
         off: standard error that the mean has besides.
     """
-    counts = np.bincount(order.ravel())
-    each = np.bincount(order.ravel(), weights=differences.ravel())[counts > 0] / counts[counts > 0]
-    error = float(each.std(ddof=1)) / len(each) ** 0.5 if len(each) > 1 else float("inf")
-    return Gain(float(differences.mean()), float(np.hypot(error, off)))
+    found = over_units(differences, order, units)
+    return Gain(0.0, math.inf) if found is None else Gain(found.mean, math.hypot(found.error, off))
 
 
-def ahead_of(oracle: Array, selectors: Mapping[str, Array], order: NDArray[np.int32], late: int, off: float = 0.0) -> str | None:
+def ahead_of(oracle: Array, selectors: Mapping[str, Array], order: NDArray[np.int32], units: Units, late: int, off: float = 0.0) -> str | None:
     """The selector furthest ahead of an oracle beyond the error, over the whole stream or from decision `late` on; None where none is.
 
     Args:
         oracle, selectors: rewards (S, T).
         order: (S, T) instance of every decision.
-        off: standard error of the oracle's mean besides that over instances.
+        units: (N,) of the instances.
+        off: standard error of the oracle's mean besides that over units.
     """
     parts = (slice(None), slice(late, None))
-    gains = [(gain_of(order[:, part], (own - oracle)[:, part], off), name) for name, own in selectors.items() for part in parts]
+    gains = [(gain_of(order[:, part], (own - oracle)[:, part], units, off), name) for name, own in selectors.items() for part in parts]
     ahead = [(gain.mean, name) for gain, name in gains if gain.beyond_error(len(gains))]
     return max(ahead)[1] if ahead else None
 

@@ -1,112 +1,134 @@
 """What a replay's choices came to: rewards with intervals, share of the learnable gap, regret, differences."""
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.estimate import Estimate, instance_draws, over_instances
-from osel_sim.analysis.gains import Gain, ahead_of, gain_of
-from osel_sim.analysis.log import Array, LoggedOutcomes
+from osel_sim.analysis.estimate import Estimate
+from osel_sim.analysis.gains import ROUNDING, Gain, ahead_of, gain_of
+from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.oracles import Oracles
 from osel_sim.analysis.outcomes import PolicyResult, overall
+from osel_sim.analysis.streamed import Streamed, Units, over_units
+from osel_sim.analysis.units import units_of
+from osel_sim.analysis.verdict import MARGIN, Played, late_from
 from osel_sim.formats.replay_result import Choices
 from osel_sim.selection.reward import RewardWeights
-from osel_sim.statistics.intervals import RESAMPLES, Interval, bootstrap_mean_interval, bootstrap_means
+from osel_sim.statistics.clustered import UnitMean, unit_mean
+from osel_sim.statistics.intervals import Interval, bootstrap_mean_interval
 
 UNBEATABLE = ("hindsight", "best_single")
 """What needs no check: nobody earns more than the one, and to pass the other is what selectors are for."""
-
-LATE = 0.25
-"""The share of a stream's decisions that counts as late."""
 
 
 @dataclass(frozen=True)
 class Curves:
     """What was received and what could have been, in every decision of every seed, (S, T).
 
+    Rewards are means over the repeats of the chosen policy on the instance: a selector learned from one of them, and could as well have had another.
+
     Attributes:
         selectors: name -> reward.
         oracles: hindsight, expected (where there are repeats), predictable, per_task, best_single -> reward; less those that are `beaten`.
         learnable: which oracle bounds what can be learned; None where those that could are beaten.
-        late: first decision of the late part.
-        expected_errors: how far the mean of the expected oracle may be off, as it was measured on the instances with repeats: bootstrap draws,
-            (RESAMPLES,); zeros without repeats.
+        order: instance of every decision.
+        units: (N,) of the instances.
+        expected_error: standard error of the expected oracle's mean, as it was measured on the instances with repeats; 0 without repeats.
         gains: oracle -> what it has over the best single policy.
         beaten: oracle -> selector that earned more than it, beyond the error of the difference, over the whole stream or its last quarter. What is
             beaten is no bound of anything.
+        margin: a smaller gap to an oracle is none to close.
     """
 
     selectors: dict[str, Array]
     oracles: dict[str, Array]
     learnable: str | None
-    late: int
-    expected_errors: Array
+    order: NDArray[np.int32]
+    units: Units
+    expected_error: float
     gains: Mapping[str, Gain]
     beaten: Mapping[str, str]
+    margin: float = MARGIN
 
-    def errors(self, oracle: str) -> Array:
-        """How far the mean of an oracle may be off, (RESAMPLES,): only the expected one is an estimate."""
-        return self.expected_errors if oracle == "expected" else np.zeros(RESAMPLES)
+    @property
+    def late(self) -> int:
+        """First decision of the late part."""
+        return late_from(self.order.shape[1])
 
-    def interval(self, oracle: str, values: Array) -> Interval:
-        """95 % bootstrap interval of the mean of values (S, T) that an oracle's rewards went into: over seeds and what the oracle may be off."""
-        low, high = np.quantile(bootstrap_means(units(values)) + self.errors(oracle), [0.025, 0.975])
-        return float(low), float(high)
+    def error(self, oracle: str | None) -> float:
+        """Standard error of an oracle's mean besides that over units: only the expected one is an estimate."""
+        return self.expected_error if oracle == "expected" else 0.0
 
 
-def curves(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: Oracles) -> Curves:
+def curves(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: Oracles, margin: float = MARGIN) -> Curves:
     """Rewards decision by decision.
 
     Args:
         log: the instances of `choices`, in its order.
         best: of the same log and weights.
+        margin: a smaller gap to an oracle is none to close.
     """
     table = log.rewards(weights)
-    outcomes = choices.outcomes(table)
-    tasks = best.per_task[choices.order][:, :, None]
+    means, units, order = mean_over_repeats(table), units_of(log), choices.order
     found = {
-        "hindsight": outcomes.max(axis=2),
-        **({} if best.expected is None else {"expected": best.expected[choices.order]}),
-        "predictable": best.predictable[choices.order],
-        "per_task": np.take_along_axis(outcomes, tasks, axis=2)[:, :, 0],
-        "best_single": outcomes[:, :, best.best_single],
+        "hindsight": choices.outcomes(table).max(axis=2),
+        **({} if best.expected is None else {"expected": best.expected[order]}),
+        "predictable": best.predictable[order],
+        "per_task": means[order, best.per_task[order]],
+        "best_single": means[order, best.best_single],
     }
-    decisions = choices.order.shape[1]
-    received = {name: choices.received(name, table) for name in choices.chosen}
-    gains = best.expected_gains
-    errors = bootstrap_means(gains, seed=1) - gains.mean() if len(gains) else np.zeros(RESAMPLES)  # another seed than that of the streams' resampling
-    off = {"expected": float(errors.std())}
-    late = decisions - max(1, int(decisions * LATE))
-    over = {name: gain_of(choices.order, values - found["best_single"], off.get(name, 0.0)) for name, values in found.items()}
-    ahead = {name: ahead_of(values, received, choices.order, late, off.get(name, 0.0)) for name, values in found.items() if name not in UNBEATABLE}
+    received = {name: means[order, chosen.astype(np.int64)] for name, chosen in choices.chosen.items()}
+    off = {"expected": _expected_error(best, units)}
+    late = late_from(order.shape[1])
+    over = {name: gain_of(order, values - found["best_single"], units, off.get(name, 0.0)) for name, values in found.items()}
+    ahead = {name: ahead_of(values, received, order, units, late, off.get(name, 0.0)) for name, values in found.items() if name not in UNBEATABLE}
     beaten = {name: selector for name, selector in ahead.items() if selector is not None}
     bounds = [name for name in (best.learnable, "predictable") if name not in beaten]
     kept = {name: values for name, values in found.items() if name not in beaten}
-    return Curves(received, kept, bounds[0] if bounds else None, late, errors, over, beaten)
+    return Curves(received, kept, bounds[0] if bounds else None, order, units, off["expected"], over, beaten, margin)
 
 
-def units(values: Array) -> Array:
-    """What is drawn anew for an interval of the mean of values (S, T): the seeds' means; of a single seed its decisions."""
-    return np.asarray(values.mean(axis=1) if len(values) > 1 else values[0], np.float64)
+def _expected_error(best: Oracles, units: Units) -> float:
+    known = np.isfinite(best.expected_gains)
+    if not known.any():
+        return 0.0
+    found = unit_mean(np.bincount(units[known], weights=best.expected_gains[known]), np.bincount(units[known]))
+    return found.error if math.isfinite(found.error) else 0.0
 
 
-def measure_selector(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str) -> dict[str, Any]:
-    """One selector: what `replay.json` says about it under `selectors`."""
+def played(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, best: Oracles) -> Played:
+    """What a verdict follows from."""
+    return Played(choices.policies, log.mean_rewards(weights), units_of(log), choices.order, choices.chosen, best.routed)
+
+
+def measure_selector(log: LoggedOutcomes, choices: Choices, rewards: Curves, name: str, table: Array) -> dict[str, Any]:
+    """One selector: what `replay.json` says about it under `selectors`.
+
+    Args:
+        table: (N, P) rewards, mean over the repeats.
+    """
     received = rewards.selectors[name]
     of_each = {"success": log.success, "subgoals": log.subgoals, "score": log.score, "steps": log.steps, "seconds": log.seconds, "price": log.price}
-    got = {what: _mean(choices.received(name, values)) for what, values in of_each.items()}
+    averaged = {what: mean_over_repeats(values) for what, values in of_each.items()}
     chosen = choices.chosen[name]
+    got = {what: _mean(values[choices.order, chosen.astype(np.int64)]) for what, values in averaged.items()}
     late = slice(rewards.late, None)
-    successes = choices.received(name, log.success)
+    streamed = Streamed.of(choices.order, chosen, len(choices.policies))
+    success = over_units(
+        averaged["success"][choices.order, chosen.astype(np.int64)], choices.order, rewards.units, streamed.learned(averaged["success"])
+    )
+    learned, learned_late = streamed.learned(table), Streamed.of(choices.order, chosen, len(choices.policies), rewards.late).learned(table)
     return {
         "mean_reward": float(received.mean()),
-        **_with_interval("ci95", over_instances(received, choices.order)),
+        "ci95": _ends(over_units(received, choices.order, rewards.units, learned)),
+        "orders_ci95": _orders(received),
         "mean_reward_late": float(received[:, late].mean()),
         "success_rate": got["success"],
-        **_with_interval("success_ci95", over_instances(successes, choices.order)),
+        "success_ci95": _ends(success, (0.0, 1.0)),
         "mean_subgoals": got["subgoals"],
         "mean_score": got["score"],
         "mean_steps": got["steps"],
@@ -114,12 +136,12 @@ def measure_selector(log: LoggedOutcomes, choices: Choices, rewards: Curves, nam
         "mean_price": got["price"],
         "shares": {policy: float((chosen == column).mean()) for column, policy in enumerate(choices.policies)},
         "shares_late": {policy: float((chosen[:, late] == column).mean()) for column, policy in enumerate(choices.policies)},
-        **_gap_entries("learnable_gap_closed", gap_closed(received, rewards, rewards.learnable, 0)),
-        **_gap_entries("learnable_gap_closed_late", gap_closed(received, rewards, rewards.learnable, rewards.late)),
-        **_gap_entries("predictable_gap_closed", gap_closed(received, rewards, "predictable", 0)),
-        **_gap_entries("predictable_gap_closed_late", gap_closed(received, rewards, "predictable", rewards.late)),
+        **_gap_entries("learnable_gap_closed", gap_closed(received, rewards, rewards.learnable, 0, learned)),
+        **_gap_entries("learnable_gap_closed_late", gap_closed(received, rewards, rewards.learnable, rewards.late, learned_late)),
+        **_gap_entries("predictable_gap_closed", gap_closed(received, rewards, "predictable", 0, learned)),
+        **_gap_entries("predictable_gap_closed_late", gap_closed(received, rewards, "predictable", rewards.late, learned_late)),
         "regret": {oracle: float((values - received).mean()) for oracle, values in rewards.oracles.items()},
-        "regret_ci95": {oracle: list(rewards.interval(oracle, values - received)) for oracle, values in rewards.oracles.items()},
+        "regret_ci95": {oracle: difference_ends(rewards, oracle, values - received, learned) for oracle, values in rewards.oracles.items()},
         "decisions_until_ahead": until_ahead(received - rewards.oracles["best_single"]),
         "decisions_until_better": until_better(received - rewards.oracles["best_single"]),
     }
@@ -141,31 +163,35 @@ def _fixed(result: PolicyResult) -> dict[str, Any]:
     return found | _with_interval("ci95", result.reward) | _with_interval("success_ci95", result.success)
 
 
-def oracle_interval(rewards: Curves, oracle: str, instances: NDArray[Any]) -> Interval:
-    """95 % bootstrap interval of an oracle's mean reward: over instances (S, T), and what the oracle may be off."""
-    draws = instance_draws(rewards.oracles[oracle].ravel(), instances.ravel(), RESAMPLES) + rewards.errors(oracle)
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return float(low), float(high)
+def difference_ends(rewards: Curves, oracle: str, values: Array, learned: Array | float = 0.0) -> list[float] | None:
+    """95 % interval of the mean of values (S, T) that an oracle's rewards went into: over units, and what the oracle may be off."""
+    found = over_units(values, rewards.order, rewards.units, learned)
+    return None if found is None else _ends(replace(found, error=math.hypot(found.error, rewards.error(oracle))))
 
 
-def gap_closed(received: Array, rewards: Curves, oracle: str | None, first: int) -> tuple[float, Interval] | None:
-    """Share of the gap to an oracle closed from decision `first` on, with its 95 % bootstrap interval over seeds and, for the expected oracle, over
-    the instances with repeats that it was measured on.
+def gap_closed(received: Array, rewards: Curves, oracle: str | None, first: int, learned: Array | float = 0.0) -> tuple[float, Interval] | None:
+    """Share of the gap to an oracle closed from decision `first` on, with its 95 % interval over units and what the expected oracle may be off.
 
-    (selector - best single) / (oracle - best single), all averaged over seeds and decisions. None where the oracle is not better than the best
-    single policy beyond its error, so that there is no gap to share, or is no bound because a selector beat it.
+    (selector - best single) / (oracle - best single), all averaged over seeds and decisions; the interval is that of a ratio (delta method). None
+    where the oracle's gain is below the margin or not more than its error, so that there is no gap to share, or where it is no bound because a
+    selector beat it.
+
+    Args:
+        learned: (N,) as `Streamed.learned` gives it.
     """
     if oracle not in rewards.oracles or not rewards.gains[oracle].beyond_error():
         return None
-    base = rewards.oracles["best_single"][:, first:]
-    gains, gaps = units(received[:, first:] - base), units(rewards.oracles[oracle][:, first:] - base)
-    if gaps.mean() <= 0.0:
+    order, base = rewards.order[:, first:], rewards.oracles["best_single"][:, first:]
+    gains, gaps = received[:, first:] - base, rewards.oracles[oracle][:, first:] - base
+    gap = float(gaps.mean())
+    if gap < max(rewards.margin, ROUNDING):
         return None
-    share = float(gains.mean() / gaps.mean())
-    # The same seed draws the same units for both.
-    above, below = bootstrap_means(gains), bootstrap_means(gaps) + rewards.errors(oracle)
-    low, high = np.quantile(above[below > 0.0] / below[below > 0.0], [0.025, 0.975])
-    return share, (float(low), float(high))
+    share = float(gains.mean()) / gap
+    found = over_units(gains - share * gaps, order, rewards.units, learned)
+    if found is None or found.units < 2:
+        return None
+    half = replace(found, error=math.hypot(found.error, share * rewards.error(oracle))).half(0.025) / gap
+    return share, (share - half, share + half)
 
 
 def until_ahead(differences: Array) -> int | None:
@@ -186,23 +212,36 @@ def until_better(differences: Array) -> int | None:
 
 
 def paired(rewards: Curves, names: Sequence[str]) -> list[dict[str, Any]]:
-    """Mean differences in reward between any two selectors on the same streams, with bootstrap intervals over seeds."""
+    """Mean differences in reward between any two selectors on the same streams, with intervals over units, and the spread over orders."""
     result = []
     for index, one in enumerate(names):
         for other in names[index + 1 :]:
             apart = rewards.selectors[one] - rewards.selectors[other]
-            difference, late = units(apart), units(apart[:, rewards.late :])
+            late = slice(rewards.late, None)
             result.append(
                 {
                     "a": one,
                     "b": other,
-                    "difference": float(difference.mean()),
-                    "ci95": list(bootstrap_mean_interval(difference)),
-                    "difference_late": float(late.mean()),
-                    "ci95_late": list(bootstrap_mean_interval(late)),
+                    "difference": float(apart.mean()),
+                    "ci95": _ends(over_units(apart, rewards.order, rewards.units)),
+                    "orders_ci95": _orders(apart),
+                    "difference_late": float(apart[:, late].mean()),
+                    "ci95_late": _ends(over_units(apart[:, late], rewards.order[:, late], rewards.units)),
                 }
             )
     return result
+
+
+def _orders(values: Array) -> list[float] | None:
+    """95 % bootstrap interval over seeds of the mean of values (S, T): what another order of the same instances would change; None of one seed."""
+    return list(bootstrap_mean_interval(values.mean(axis=1))) if len(values) > 1 else None
+
+
+def _ends(found: UnitMean | None, within: Interval = (-math.inf, math.inf)) -> list[float] | None:
+    """A 95 % interval for a file; None where it is unbounded, for want of units."""
+    if found is None or found.units < 2:
+        return None
+    return [min(max(end, within[0]), within[1]) for end in found.interval()]
 
 
 def _with_interval(name: str, estimate: Estimate | None) -> dict[str, Any]:

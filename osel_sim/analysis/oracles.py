@@ -23,9 +23,11 @@ class Oracles:
     Attributes:
         best_single, worst_single: columns of the policies with the highest and the lowest mean reward over all instances.
         expected: (N,) reward of the policy that was best on the same instance in other repeats, an estimate where it has none; None without repeats.
-        expected_gains: what it has over `predictable` on each of the instances with repeats; the mean of `expected` is as sure as theirs.
+        expected_gains: (N,) what it has over `predictable` on each of the instances with repeats, NaN on others; the mean of `expected` is as sure as
+            theirs.
         predictable: (N,) reward of the policy that a supervised router, trained on *other* instances, names.
         router: which one (`osel_sim.analysis.routers`), for each half of the instances (`first`, `second`) it was scored on.
+        routed: name of every router that was tried -> (N,) reward of the policy it names, learned on the half that the instance is not in.
         per_task: column of the policy with the highest mean reward on each instance's task, (N,).
     """
 
@@ -35,6 +37,7 @@ class Oracles:
     expected_gains: Array
     predictable: Array
     router: dict[str, str]
+    routed: dict[str, Array]
     per_task: NDArray[np.int64]
 
     @property
@@ -49,10 +52,10 @@ def oracles(log: LoggedOutcomes, weights: RewardWeights) -> Oracles:
     means = mean_over_repeats(rewards)
     if not len(means) or not np.isfinite(means).all():
         raise DataError(f"{log.source}: oracles need an outcome of every policy on every instance")
-    predictable, router = predictable_oracle(log, means)
+    predictable, router, routed = predictable_oracle(log, means)
     overall = means.mean(axis=0)
-    expected, gains = expected_oracle(rewards, predictable) or (None, np.zeros(0))
-    return Oracles(int(overall.argmax()), int(overall.argmin()), expected, gains, predictable, router, per_task(log, means))
+    expected, gains = expected_oracle(rewards, predictable) or (None, np.full(len(means), np.nan))
+    return Oracles(int(overall.argmax()), int(overall.argmin()), expected, gains, predictable, router, routed, per_task(log, means))
 
 
 def expected_oracle(rewards: Array, reference: Array) -> tuple[Array, Array] | None:
@@ -68,7 +71,7 @@ def expected_oracle(rewards: Array, reference: Array) -> tuple[Array, Array] | N
         reference: (N,) reward of some other way to choose on every instance, such as `predictable_oracle`.
 
     Returns:
-        reward on every instance, (N,), and the gains over the reference of the instances that can be split; None if none can.
+        reward on every instance, (N,), and the gains over the reference of the instances that can be split, (N,), NaN of others; None if none can.
     """
     known = np.isfinite(rewards)
     number = np.cumsum(known, axis=2) - 1  # the how-manieth valid repeat each is
@@ -82,10 +85,12 @@ def expected_oracle(rewards: Array, reference: Array) -> tuple[Array, Array] | N
     gains = (one + other) / 2.0 - reference[rows]
     value = reference + gains.mean()
     value[rows] = reference[rows] + gains
-    return value, gains
+    everywhere = np.full(len(reference), np.nan)
+    everywhere[rows] = gains
+    return value, everywhere
 
 
-def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[str, str]]:
+def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[str, str], dict[str, Array]]:
     """Policy that a supervised router names for an instance, learned on one half of the instances and scored on the other, both ways round.
 
     Which of the routers it is (one policy for all, the best of a group, a model of the contexts: `osel_sim.analysis.routers`) is chosen on the
@@ -97,7 +102,7 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
         means: (N, P) mean rewards.
 
     Returns:
-        its reward on every instance, (N,), and the router used for each half.
+        its reward on every instance, (N,), the router used for each half, and the rewards (N,) of every router that routes at all.
     """
     from threadpoolctl import threadpool_limits
 
@@ -111,11 +116,13 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
         best = max(tried, key=lambda name: float(tried[name].sum()))  # the first, which knows least, where several are equal
         ahead = tried[best] - tried[SINGLE]
         used.append(best if len(ahead) and ahead.sum() > ahead.std() * np.sqrt(len(ahead)) else SINGLE)
-        return _received(means, found[used[-1]], by, on)
+        return np.stack([_received(means, router, by, on) for router in found.values()], axis=1)
 
     with threadpool_limits(1):  # the last bits of a matrix product depend on the number of threads
-        value = cross_fit(~half, decide)
-    return value, dict(zip(("first", "second"), used, strict=True))
+        table = cross_fit(~half, decide)
+    routed = dict(zip(found, table.T, strict=True))
+    value = np.where(half, routed[used[1]], routed[used[0]])
+    return value, dict(zip(("first", "second"), used, strict=True)), {name: own for name, own in routed.items() if name != SINGLE}
 
 
 def _received(means: Array, router: Router, by: Rows, on: Rows) -> Array:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
+from osel_sim.analysis.units import units_of
 from osel_sim.selection.reward import RewardWeights
 
 EVERYTHING = "all"
@@ -70,7 +71,7 @@ def overall(log: LoggedOutcomes, weights: RewardWeights) -> list[PolicyResult]:
 
 
 def _results(log: LoggedOutcomes, weights: RewardWeights, parts: Mapping[str, NDArray[np.bool_]]) -> list[PolicyResult]:
-    rewards, seconds = log.rewards(weights), log.seconds
+    rewards, seconds, units = log.rewards(weights), log.seconds, units_of(log)
     return [
         PolicyResult(
             group,
@@ -80,8 +81,11 @@ def _results(log: LoggedOutcomes, weights: RewardWeights, parts: Mapping[str, ND
             int(log.errors[rows, column].sum()),
             int(log.fallbacks[rows, column].sum()),
             int(log.solved_by_fallback[rows, column].sum()),
-            rate_of(log.success[rows, column]),
-            *(mean_of(mean_over_repeats(values[rows, column])) for values in (log.subgoals, log.score, rewards, log.steps, seconds, log.price)),
+            rate_of(log.success[rows, column], units[rows]),
+            *(
+                mean_of(mean_over_repeats(values[rows, column]), units[rows])
+                for values in (log.subgoals, log.score, rewards, log.steps, seconds, log.price)
+            ),
         )
         for group, rows in parts.items()
         for column, policy in enumerate(log.policies)

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from osel_sim.analysis.log import LoggedOutcomes
-from osel_sim.analysis.measures import curves, measure_selector, oracle_interval, paired
+from osel_sim.analysis.measures import Curves, curves, difference_ends, measure_fixed, measure_selector, paired, played
 from osel_sim.analysis.oracles import Oracles
 from osel_sim.analysis.streams import LeftOut
-from osel_sim.analysis.verdict import reward_span, verdict
+from osel_sim.analysis.verdict import MARGIN, advisable, verdict
+from osel_sim.analysis.verdict_words import headline, limit, sentences
 from osel_sim.analysis.weights_map import AXES
 from osel_sim.formats.replay_result import Choices
 from osel_sim.selection.reward import RewardWeights
@@ -29,30 +30,43 @@ def with_fixed(choices: Choices, best: Oracles) -> Choices:
 
 
 def build(
-    log: LoggedOutcomes, weights: RewardWeights, preset: str | None, choices: Choices, best: Oracles, left_out: LeftOut, seeds: Sequence[int]
+    log: LoggedOutcomes,
+    weights: RewardWeights,
+    preset: str | None,
+    choices: Choices,
+    best: Oracles,
+    left_out: LeftOut,
+    seeds: Sequence[int],
+    margin: float = MARGIN,
+    halved: bool = False,
+    route_with: Sequence[str] | None = None,
 ) -> dict[str, Any]:
-    """What `replay.json` holds.
+    """What `replay.json` holds. May be called at any moment, of the selectors that are there so far.
 
     Args:
         log: the instances of `choices`, in its order.
         preset: name of the paper's weights, where they are that.
         choices: with the fixed policies (`with_fixed`).
+        margin: a gain in reward a decision below it is not worth routing for.
+        halved: whether selectors were shown the log's other half where they start warm.
+        route_with: selectors that the verdict may advise; None: those that we recommend (`osel_sim.analysis.verdict.advisable`).
 
     Returns:
         log (folder, instances, left_out, policies, repeats, encoder, tasks), reward, seeds, decisions, selectors, oracles, learnable_oracle, paired,
         verdict, and frontier, which is None until it is replayed (`osel_sim.analysis.frontier`). Each selector has a `kind`: `learner`, `random` or
         `fixed` (with its `policy`).
     """
-    rewards = curves(log, weights, choices, best)
+    rewards = curves(log, weights, choices, best, margin)
     policies = choices.policies
     singles = {BEST: policies[best.best_single], WORST: policies[best.worst_single]}
-    selectors = {name: {**kind(name, singles), **measure_selector(log, choices, rewards, name)} for name in choices.chosen}
-    learners = [name for name, entry in selectors.items() if entry["kind"] == "learner"]
+    selectors = _selectors(log, weights, choices, rewards, singles)
+    always = {BEST: {key: selectors[BEST][key] for key in ("mean_reward", "ci95")}}
     return {
         "log": {
             "folder": str(log.source),
             "tasks": sorted(set(log.labels("task"))),
             "instances": len(log),
+            "units": int(rewards.units.max()) + 1,
             "left_out": asdict(left_out),
             "policies": list(policies),
             "repeats": log.repeats,
@@ -66,23 +80,68 @@ def build(
         "oracles": {
             name: {
                 "mean_reward": float(values.mean()),
-                "ci95": list(oracle_interval(rewards, name, choices.order)),
+                "ci95": difference_ends(rewards, name, values),
                 "mean_reward_late": float(values[:, rewards.late :].mean()),
                 "gain": rewards.gains[name].mean,
                 "gain_ci95": rewards.gains[name].ends,
             }
+            | always.get(name, {})
             for name, values in rewards.oracles.items()
         },
         "learnable_oracle": {
             "name": rewards.learnable,
-            "repeated": len(best.expected_gains),
+            "repeated": int(np.isfinite(best.expected_gains).sum()),
             "router": best.router,
             "beaten": dict(rewards.beaten),
         },
-        "paired": paired(rewards, [*learners, *(name for name, entry in selectors.items() if entry["kind"] == "random"), BEST]),
-        "verdict": verdict(rewards, learners, selectors, policies[best.best_single], reward_span(log.rewards(weights))),
+        "paired": paired(rewards, [*_of_kind(selectors, "learner"), *_of_kind(selectors, "random"), BEST]),
+        "verdict": _verdict(log, weights, choices, best, rewards, selectors, halved, route_with),
         "frontier": None,
     }
+
+
+def _selectors(
+    log: LoggedOutcomes, weights: RewardWeights, choices: Choices, rewards: Curves, singles: Mapping[str, str]
+) -> dict[str, dict[str, Any]]:
+    """What each came to; a fixed policy, of which the streams show no more than the log does, as the table of policies has it."""
+    table = log.mean_rewards(weights)
+    always = measure_fixed(log, weights) if choices.order.shape[1] == len(log) else {}
+    found = {name: {**kind(name, singles), **measure_selector(log, choices, rewards, name, table)} for name in choices.chosen}
+    return {name: entry | always.get(entry.get("policy", ""), {}) for name, entry in found.items()}
+
+
+def _of_kind(selectors: Mapping[str, Mapping[str, Any]], wanted: str) -> list[str]:
+    return [name for name, entry in selectors.items() if entry["kind"] == wanted]
+
+
+def _verdict(
+    log: LoggedOutcomes,
+    weights: RewardWeights,
+    choices: Choices,
+    best: Oracles,
+    rewards: Curves,
+    selectors: Mapping[str, Mapping[str, Any]],
+    halved: bool,
+    route_with: Sequence[str] | None,
+) -> dict[str, Any]:
+    """The verdict, its words, and what the learnable oracle gains."""
+    tested, error = advisable(_of_kind(selectors, "learner"), halved, route_with)
+    found = verdict(played(log, weights, choices, best), tested, rewards.margin, error)
+    stake = found["stake"] or {}
+    one, other = selectors.get(stake.get("selector", "")), selectors[f"fixed:{found['policy']}"]
+    learnable = None if rewards.learnable is None else rewards.gains[rewards.learnable]
+    stake |= {} if one is None else {key: _difference(one[key], other[key]) for key in ("success_rate", "mean_seconds", "mean_steps", "mean_price")}
+    stake |= {
+        "learnable_oracle": rewards.learnable,
+        "learnable_gain": None if learnable is None else learnable.mean,
+        "learnable_gain_ci95": None if learnable is None else learnable.ends,
+    }
+    told = sentences(found, one, other, weights, limit(rewards))
+    return {**found, "headline": headline(found), "sentences": told, "text": " ".join([f"{headline(found)}.", *told]), "stake": stake}
+
+
+def _difference(one: float | None, other: float | None) -> float | None:
+    return None if one is None or other is None else one - other
 
 
 def kind(name: str, singles: Mapping[str, str]) -> dict[str, Any]:

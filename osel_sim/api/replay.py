@@ -2,13 +2,15 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from osel_sim.api.results import ReplayResult
 from osel_sim.api.reward import weights_of
-from osel_sim.api.settings import MAIN, OTHER, Count, Folder, LoggedRewardSettings, Names, settings
+from osel_sim.api.settings import MAIN, OTHER, Count, Folder, LoggedRewardSettings, Names, NonNegative, settings
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
@@ -20,9 +22,6 @@ if TYPE_CHECKING:
     from osel_sim.selection.reward import RewardWeights
 
 logger = logging.getLogger(__name__)
-
-COSTS, SKILLS, PARTS = "expected_costs", "skills", "parts"
-"""Settings of selectors that are told what policies cost, what they were made for, and what a context consists of, rather than learn it."""
 
 SOONEST = ("auto", "linucb")
 """Selectors that are replayed first: they take seconds where PPO takes minutes, and the verdict hardly ever changes with the others."""
@@ -58,6 +57,10 @@ class ReplayConfig(LoggedRewardSettings):
     """do not tell auto what policies were made for (default: it is told what the log says of it)"""
     no_frontier: Annotated[bool, OTHER] = False
     """do not replay selectors at other weights of time and price as well"""
+    margin: Annotated[NonNegative, OTHER] = 0.02
+    """a gain in reward a decision that is not worth routing for"""
+    route_with: Annotated[Names | None, OTHER] = None
+    """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
     encoder: Annotated[str | None, OTHER] = None
     """whose contexts, where the log has several (default: the one it was recorded with)"""
     context: Annotated[Literal["task"] | None, OTHER] = None
@@ -143,8 +146,7 @@ class _Replay:
         off_policy: dict[str, Any] | None = None,
     ) -> ReplayResult:
         """Replay stage by stage: what a verdict needs, all other selectors, and again at other weights. Each is written and told."""
-        from osel_sim.analysis.engine import Part
-        from osel_sim.analysis.engine import replay as replay_parts
+        from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import build, tables, with_fixed
         from osel_sim.core.progress import progress
@@ -156,20 +158,27 @@ class _Replay:
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
         here = setup(weights)
-        best = oracles(log, weights)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
         parts = [*stages, *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
-        with progress(sum(part.total for part in parts), "decision", scale=True) as bar:
-            for part, made in zip(parts, replay_parts(parts, config.workers, bar.update, self.factories), strict=True):
+        with (
+            progress(sum(part.total for part in parts), "decision", scale=True) as bar,
+            closing(replay_parts(parts, config.workers, bar.update, self.factories)) as replayed,
+            ThreadPoolExecutor(1) as beside,
+        ):
+            bounds = beside.submit(oracles, log, weights)  # while workers begin
+            if config.workers == 1:
+                bounds.result()  # what is replayed in this process limits its threads, on which last bits depend
+            for part, made in zip(parts, replayed, strict=True):
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}
+                    best = bounds.result()
                     choices = with_fixed(replace(made[0], chosen=known), best)
-                    result = build(log, weights, preset, choices, best, left_out, seeds)
+                    result = build(log, weights, preset, choices, best, left_out, seeds, config.margin, config.half is not None, config.route_with)
                     result["log"] |= {"half": config.half, "context": config.context}
                     result["off_policy"] = off_policy
                     result |= _told(here)
@@ -218,19 +227,14 @@ class _Replay:
     def _setups(self, log: "LoggedOutcomes", others: "LoggedOutcomes", selectors: Sequence[str]) -> "Callable[[RewardWeights], Setup]":
         """Under what to replay at any weights: what selectors are told, and shown before their stream begins."""
         from osel_sim.analysis.engine import Setup
+        from osel_sim.analysis.told import told
         from osel_sim.analysis.warm_start import WarmStart
-        from osel_sim.selection.registry import wanted_of
 
-        config = self.config
+        config, named = self.config, [name for name in selectors if name not in self.factories]
 
         def setup(weights: "RewardWeights") -> Setup:
-            known: dict[str, Any] = {} if config.unknown_costs else {COSTS: others.expected_costs(weights)}
-            if log.skills is not None and not config.unknown_skills:
-                known[SKILLS] = log.skills
-            if log.parts:
-                known[PARTS] = log.parts
             warm_start = WarmStart(others.contexts, others.rewards(weights)) if config.half else None
-            return Setup(weights, {name: wanted_of(name, known) for name in selectors if name not in self.factories}, warm_start)
+            return Setup(weights, told(log, others, weights, named, not config.unknown_costs, not config.unknown_skills), warm_start)
 
         return setup
 
@@ -265,6 +269,8 @@ def _stages(selectors: Sequence[str]) -> list[list[str]]:
 
 def _told(setup: "Setup") -> dict[str, Any]:
     """What selectors were told, as `replay.json` has it."""
+    from osel_sim.analysis.told import COSTS, SKILLS
+
     told = setup.settings.values()
     skills = next((settings[SKILLS] for settings in told if SKILLS in settings), None)
     return {

@@ -46,9 +46,15 @@ class ReportConfig(LoggedRewardSettings):
 
 @dataclass(frozen=True)
 class ReportResult:
-    """What `report` wrote; figures/ and tables/ lie beside the page."""
+    """What `report` wrote; figures/ and tables/ lie beside the page.
+
+    Attributes:
+        page: the file.
+        verdict: what it says first.
+    """
 
     page: Path
+    verdict: str = ""
 
     def _repr_html_(self) -> str:
         """A link, in a notebook."""
@@ -70,12 +76,13 @@ def report(folder: "Path | str | ReportConfig", **values: Any) -> ReportResult:
     from osel_sim.reporting.page import write_page
 
     config = folder.changed(**values) if isinstance(folder, ReportConfig) else ReportConfig.of(folder=Path(folder), **values)
-    page = write_page(_page(config), config.out or config.folder)
+    content = _page(config)
+    page = write_page(content, config.out or config.folder)
     if config.open:
         import webbrowser
 
         webbrowser.open(page.resolve().as_uri())
-    return ReportResult(page)
+    return ReportResult(page, content.verdict.headline)
 
 
 def watch(folder: "Path | str | ReportConfig", on_start: Callable[[str], None], **values: Any) -> None:

@@ -32,6 +32,7 @@ class RunResult:
         journal: its decisions.
         page: the page about it, or None where it could not be written.
         interrupted: Ctrl-C ended it; `run(..., resume=True)` goes on.
+        verdict: whether routing is worth it on its instances, as the page says it; empty without a page.
     """
 
     folder: Path
@@ -39,6 +40,7 @@ class RunResult:
     journal: "tuple[Decision, ...]"
     page: Path | None = None
     interrupted: bool = False
+    verdict: str = ""
 
     @cached_property
     def decisions(self) -> "pandas.DataFrame":

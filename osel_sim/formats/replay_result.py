@@ -19,7 +19,10 @@ from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_bytes, write_json
 from osel_sim.core.interrupts import uninterrupted
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""Version 2 has a verdict of three, with its words; intervals are over units. A replay of version 1 is shown as it was written."""
+READABLE = (1, 2)
+OFF_POLICY_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
 PENDING, FRONTIER = "pending", "frontier"
 """Key of `replay.json` while not all is replayed: names of the selectors that are missing, and `frontier` where that is."""
@@ -110,8 +113,8 @@ def read_replay(folder: Path) -> tuple[dict[str, Any], Choices]:
     if not (folder / REPLAY).is_file():
         raise DataError(f"{folder / REPLAY} does not exist; python -m osel_sim.replay LOG --out {folder} writes it")
     result = read_json(folder / REPLAY)
-    if result.get("schema_version") != SCHEMA_VERSION:
-        raise DataError(f"{folder / REPLAY}: schema_version must be {SCHEMA_VERSION}, got {result.get('schema_version')}")
+    if result.get("schema_version") not in READABLE:
+        raise DataError(f"{folder / REPLAY}: schema_version must be {' or '.join(map(str, READABLE))}, got {result.get('schema_version')}")
     file = folder / CHOICES
     try:
         content = file.read_bytes()
@@ -134,7 +137,7 @@ def write_off_policy(folder: Path, found: Mapping[str, Any]) -> None:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_json(folder / OFF_POLICY, {"schema_version": SCHEMA_VERSION, **found})
+        write_json(folder / OFF_POLICY, {"schema_version": OFF_POLICY_VERSION, **found})
     except OSError as error:
         raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
 

@@ -189,6 +189,17 @@ def start_or_resume(
     ]
 
 
+def note_growth(folder: Path, episodes: int) -> None:
+    """Write down that a run is to have more decisions than it began with.
+
+    Raises:
+        DataError: its `run.json` cannot be read.
+    """
+    run = read_run(folder)
+    settings = {"settings": run["settings"] | {"episodes": episodes}} if isinstance(run.get("settings"), dict) else {}
+    write_json(folder / RUN, run | settings | {"configuration": run["configuration"] | {"episodes": episodes}})
+
+
 def _compare(file: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
     was, now = _flat(old), _flat(new)
     for key in [*now, *(key for key in was if key not in now)]:

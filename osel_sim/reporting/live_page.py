@@ -15,11 +15,13 @@ class LivePage(RunSubscriber):
 
     Attributes:
         file: the page, or None where there is none.
+        verdict: what it says first, and why; empty where there is none.
         problem: why it could not be written, or None. The run itself is complete then; `python -m osel_sim.report` tries again.
     """
 
     def __init__(self) -> None:
         self.file: Path | None = None
+        self.verdict = ""
         self.problem: OselError | None = None
 
     @override
@@ -27,7 +29,9 @@ class LivePage(RunSubscriber):
         if not run.decisions:
             return
         try:
-            self.file = write_page(run_page(run.folder), run.folder)
+            page = run_page(run.folder)
+            self.file = write_page(page, run.folder)
+            self.verdict = " ".join([f"{page.verdict.headline}.", *page.verdict.sentences])
             write_bytes(run.folder / "curve.png", (run.folder / FIGURES / "curves.png").read_bytes())  # where one looks first
         except OselError as problem:
             self.problem = problem

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from osel_sim.analysis.answer import answer
 from osel_sim.analysis.clusters import complete_rows
 from osel_sim.analysis.estimate import Estimate
 from osel_sim.analysis.evaluation import evaluate
@@ -16,6 +17,7 @@ from osel_sim.reporting.log_sections import context_figure, formula, policy_bloc
 from osel_sim.reporting.off_policy_section import off_policy_table, off_policy_verdict
 from osel_sim.reporting.page import Block, Page, Section, Tile, Verdict
 from osel_sim.reporting.routes import route_figure
+from osel_sim.reporting.verdict_tiles import shown_verdict
 from osel_sim.selection.reward import RewardWeights
 
 
@@ -29,14 +31,14 @@ def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_sc
     Raises:
         DataError: the log lacks what the weights ask for.
     """
-    sections, routing = log_sections(log, weights)
+    sections, _ = log_sections(log, weights)
     found = evaluate(choices_of(log), weights) if has_choices(log) else None
     if found is not None:
         sections.insert(0, Section("off_policy", "Other ways of choosing", [off_policy_table(found)]))
     title = f"{few(sorted(set(log.labels('task'))))}: {len(log):,} instances, {len(log.policies)} policies"
     rows = read_rollouts(log.source)[0] if rows is None else rows
     episodes = list_episodes(log, weights, notes=notes_of(rows, log), scenes=scenes(log))
-    verdict = off_policy_verdict(found) if found is not None else _verdict(log, weights, routing)
+    verdict = off_policy_verdict(found) if found is not None else _verdict(log, weights)
     return Page("Rollout log", title, verdict, sections, log_facts(log, weights), episodes, route_figure(log, weights))
 
 
@@ -109,26 +111,19 @@ def bounds(low: float, high: float) -> str:
     return f"[{low:.3f}, {high:.3f}]".replace("-", "\u2212")
 
 
-def _verdict(log: LoggedOutcomes, weights: RewardWeights, routing: Routing | None) -> Verdict:
+def _verdict(log: LoggedOutcomes, weights: RewardWeights) -> Verdict:
     rewards = log.mean_rewards(weights)[complete_rows(log, weights)]
-    means = rewards.mean(axis=0)
-    best, oracle = int(means.argmax()), float(rewards.max(axis=1).mean())
+    best = int(rewards.mean(axis=0).argmax())
     always = overall(log, weights)[best]  # as the table of policies has it
     reward, success = always.reward, always.success
     rate = f"95% [{100 * success.low:.0f}, {100 * success.high:.0f}]" if success else ""
     tiles = [
         Tile("best single policy", log.policies[best], f"mean reward {reward.value:.3f}, 95% {interval(reward)}" if reward else ""),
-        Tile("its success", f"{100 * success.value:.0f}%" if success else "–", rate),
-        Tile("hindsight oracle", f"{oracle:.3f}", "mean reward; optimistic, not learnable where outcomes are noisy"),
+        Tile("its success", f"{100 * success.value:.0f}%" if success else "\u2013", rate),
     ]
-    held_out = routing.inequality.held_out if routing else None
-    sentences = [f"Always {log.policies[best]} has the highest mean reward; knowing each outcome beforehand would add {oracle - means[best]:.3f}."]
-    if held_out is None:
-        return Verdict(f"Best single policy: {log.policies[best]}", [*sentences, "There are too few instances to say what context is worth."], tiles)
-    tiles.insert(1, Tile("routing by cluster adds", signed(held_out.value), f"mean reward, held out, 95% {interval(held_out)}"))
-    change = f"{signed(held_out.value)} {interval(held_out)}"
-    by_cluster = f"Choosing by the cluster an instance lies in changes the mean reward by {change} on instances not used to choose"
-    if held_out.low > 0.0:
-        return Verdict("There is something to route by", [*sentences, f"{by_cluster}."], tiles, "good")
-    sentences.append(f"{by_cluster}: no gain can be seen. A replay shows whether a selector that learns finds more.")
-    return Verdict(f"Little to route by: always {log.policies[best]} is hard to beat", sentences, tiles)
+    found = answer(log, weights)
+    if found is None:
+        return Verdict(
+            f"There is one policy: {log.policies[best]}", ["With a second one the page says whether routing between them is worth it."], tiles
+        )
+    return shown_verdict(found, tiles=tiles)

@@ -2,19 +2,19 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from osel_sim.analysis.clusters import score_of
-from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
 from osel_sim.analysis.frontier import measured
 from osel_sim.analysis.live import is_live_run, read_live
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats, read_log
-from osel_sim.analysis.measures import curves, measure_fixed
+from osel_sim.analysis.measures import curves
 from osel_sim.analysis.oracles import oracles
+from osel_sim.analysis.units import units_of
 from osel_sim.context.appended import TASK_NAME
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.replay_result import PENDING, REPLAY, Choices, read_replay
@@ -38,6 +38,7 @@ from osel_sim.reporting.selector_sections import (
     regret_figure,
     share_figure,
 )
+from osel_sim.reporting.verdict_tiles import TONES, gain_tiles
 from osel_sim.selection.reward import RewardWeights
 
 _MOST_PICKS, _MOST_SHOWN = 4, 3
@@ -129,14 +130,13 @@ def _read(folder: Path, log_folder: Path | None) -> _Replay:
 def _page(replay: _Replay, scenes: Scenes) -> Page:
     result, choices, log, names, streams = replay.result, replay.choices, replay.log, replay.names, replay.streams
     weights, look, learners = replay.weights, replay.look, replay.learners
-    told = _as_the_log_tells(result, log, weights)
-    selectors: list[Block] = [curve_figure(streams, look), selector_table(told, names)]
+    selectors: list[Block] = [curve_figure(streams, look), selector_table(result, names)]
     gap = gap_figure({names[name]: gaps(entry) for name, entry in result["selectors"].items() if entry["kind"] == "learner"}, replay.learnable)
     regret = regret_figure(streams, [*_ends(result, names)[:1], *(word for word in ORACLES.values() if word in streams)], look)
     shares = share_figure({shown: streams[shown] for shown in learners.values()}, log.policies, look)
-    penalty = penalty_figure(streams, weights, look, choices.order, _always(log, weights, names))
+    penalty = penalty_figure(streams, weights, look, choices.order, units_of(log))
     selectors += [block for block in (gap, regret, penalty, shares) if block is not None]
-    selectors += [oracle_table(told), *paired_tables(result, names)]
+    selectors += [oracle_table(result), *paired_tables(result, names)]
     selectors += [off_policy_table(result["off_policy"])] if result.get("off_policy") else []
     shared, _ = log_sections(log, weights, Replayed(_points(log, weights, choices, learners), result.get("frontier"), look))
     title = f"{few(result['log']['tasks'])}: {len(learners)} selectors over {choices.order.shape[1]:,} decisions, {len(choices.order)} seeds"
@@ -145,7 +145,7 @@ def _page(replay: _Replay, scenes: Scenes) -> Page:
     routes = route_figure(log, weights, _chosen(choices, who, names) if who in names else None)
     sections = [Section("selectors", "Selectors", selectors), *shared]
     facts, episodes = _facts(replay.folder, result, log, weights), _episodes(log, weights, choices, names, look, scenes(log))
-    return Page("Replay", title, _verdict(told), sections, facts, episodes, routes)
+    return Page("Replay", title, _verdict(result), sections, facts, episodes, routes)
 
 
 def _speaker(result: Mapping[str, Any]) -> str:
@@ -203,47 +203,27 @@ def _ends(result: Mapping[str, Any], names: Mapping[str, str]) -> list[str]:
 
 
 def _streams(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str]) -> dict[str, Stream]:
-    """What every selector and oracle received in each decision."""
+    """What every selector and oracle received in each decision: of a policy, the mean over its repeats on the instance."""
     rewards = log.rewards(weights)
     score = score_of(log, weights)
-    tables = [choices.outcomes(table) for table in (rewards, log.success, score, score - rewards, log.seconds, log.price)]
-
-    def stream(columns: Array) -> Stream:
-        chosen = columns.astype(np.int64)
-        reward, success, score, penalty, seconds, price = (np.take_along_axis(table, chosen[:, :, None], axis=2)[:, :, 0] for table in tables)
-        return Stream(reward, success, score, penalty, seconds, price, chosen)
-
-    streams = {shown: stream(choices.chosen[name].astype(np.float64)) for name, shown in names.items()}
+    tables = (rewards, log.success, score, score - rewards, log.seconds, log.price)
+    means = [mean_over_repeats(table) for table in tables]
+    streams = {}
+    for name, shown in names.items():
+        chosen = choices.chosen[name].astype(np.int64)
+        reward, success, own, penalty, seconds, price = (table[choices.order, chosen] for table in means)
+        streams[shown] = Stream(reward, success, own, penalty, seconds, price, chosen)
     found = curves(log, weights, choices, oracles(log, weights))
     nothing = np.full(choices.order.shape, np.nan)
     for name, shown in ORACLES.items():
         if name == "hindsight":
-            best = stream(np.nan_to_num(tables[0], nan=-np.inf).argmax(axis=2).astype(np.float64))
-            streams[shown] = replace(best, chosen=None)
+            drawn = [choices.outcomes(table) for table in tables]
+            best = np.nan_to_num(drawn[0], nan=-np.inf).argmax(axis=2)[:, :, None]
+            reward, success, own, penalty, seconds, price = (np.take_along_axis(table, best, axis=2)[:, :, 0] for table in drawn)
+            streams[shown] = Stream(reward, success, own, penalty, seconds, price)
         elif name in found.oracles:
             streams[shown] = Stream(found.oracles[name], *[nothing] * 5)
     return streams
-
-
-def _as_the_log_tells(result: Mapping[str, Any], log: LoggedOutcomes, weights: RewardWeights) -> dict[str, Any]:
-    """The result with what fixed policies come to over all repeats, as the table of policies has it, not over those that the streams drew."""
-    found = measure_fixed(log, weights)
-    selectors = {name: {**entry, **found.get(entry.get("policy"), {})} for name, entry in result["selectors"].items()}
-    best = found[result["selectors"]["best_single"]["policy"]]
-    single = result["oracles"]["best_single"] | {key: best[key] for key in ("mean_reward", "ci95")}
-    return {**result, "selectors": selectors, "oracles": {**result["oracles"], "best_single": single}}
-
-
-def _always(log: LoggedOutcomes, weights: RewardWeights, names: Mapping[str, str]) -> dict[str, tuple[Estimate | None, Estimate | None]]:
-    """What the reward counts as success, and what it takes off, of each fixed policy by its name on the page, as the table of policies has them."""
-    score = score_of(log, weights)
-    penalty = score - log.rewards(weights)
-    of_score = rate_of if weights.success == "success" else lambda values: mean_of(mean_over_repeats(values))
-    return {
-        names[f"fixed:{policy}"]: (of_score(score[:, column]), mean_of(mean_over_repeats(penalty[:, column])))
-        for column, policy in enumerate(log.policies)
-        if f"fixed:{policy}" in names
-    }
 
 
 def _points(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names: Mapping[str, str]) -> dict[str, dict[str, float]]:
@@ -257,20 +237,21 @@ def _points(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, names
 
 
 def _verdict(result: Mapping[str, Any]) -> Verdict:
-    found, stake = result["verdict"], result["verdict"]["stake"]
+    found = result["verdict"]
+    if result["schema_version"] == 1:
+        return _first_verdict(result)
+    single = result["oracles"]["best_single"]
+    tiles = [Tile("best single policy", found["policy"], f"mean reward {single['mean_reward']:.3f}"), *gain_tiles(found), _learnable(found["stake"])]
+    return Verdict(found["headline"], found["sentences"], tiles, TONES[found["decision"]])
+
+
+def _first_verdict(result: Mapping[str, Any]) -> Verdict:
+    """Of a replay of version 1, in whose words it was."""
+    found = result["verdict"]
     route = found["decision"] == "route"
     headline = f"Route with {found['selector']}" if route else f"Do not route: always use {found['policy']}"
-    text = str(found["text"])
-    for ending in (": ", ". "):
-        text = text.removeprefix(headline + ending)
-    single = result["oracles"]["best_single"]
-    tiles = [Tile("best single policy", found["policy"], f"mean reward {single['mean_reward']:.3f}")]
-    if stake.get("selector"):
-        gain, late = stake["gain"], stake["gain_late"]
-        tiles.append(Tile(f"{stake['selector']} over it", signed(gain), f"reward a decision, bounds {bounds(*stake['gain_bounds'])}"))
-        tiles.append(Tile("in the last quarter", signed(late), f"reward a decision, bounds {bounds(*stake['gain_late_bounds'])}"))
-    tiles.append(_learnable(stake))
-    return Verdict(headline, [text[:1].upper() + text[1:]], tiles, "good" if route else "neutral")
+    tiles = [Tile("best single policy", found["policy"], f"mean reward {result['oracles']['best_single']['mean_reward']:.3f}")]
+    return Verdict(headline, [str(found["text"])], tiles, "good" if route else "neutral")
 
 
 def _learnable(stake: Mapping[str, Any]) -> Tile:

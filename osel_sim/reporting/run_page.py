@@ -1,18 +1,21 @@
 """The page of a live run."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from osel_sim.analysis.answer import BUDGET, answer
 from osel_sim.analysis.clusters import score_of
-from osel_sim.analysis.estimate import Estimate, mean_of, rate_of
+from osel_sim.analysis.estimate import mean_of, rate_of
 from osel_sim.analysis.evaluation import evaluate
 from osel_sim.analysis.live import LiveLog, read_live
 from osel_sim.analysis.log import FLAGS, Array, LoggedOutcomes
+from osel_sim.analysis.units import units_of
+from osel_sim.analysis.verdict_words import in_units
 from osel_sim.core.errors import DataError
 from osel_sim.formats.journal import Decision
 from osel_sim.formats.run_config import read_run
@@ -27,6 +30,7 @@ from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdic
 from osel_sim.reporting.palette import colours
 from osel_sim.reporting.routes import Chosen, route_figure
 from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, look_of, penalty_figure, regret_figure
+from osel_sim.reporting.verdict_tiles import shown_verdict
 from osel_sim.selection.registry import RECOMMENDATION, is_recommended
 from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
 from osel_sim.statistics.betting import advantage_bounds
@@ -37,12 +41,13 @@ ERROR = 0.05
 """Probability, at most, that the bounds of the verdict do not hold."""
 
 
-def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = None) -> Page:
+def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = None, budget: int = BUDGET) -> Page:
     """The page of a live run's folder.
 
     Args:
         scenes: draws how some of its instances begin.
         beside: folder of the page, where it is not the run's.
+        budget: decisions that are replayed for the verdict, at most.
 
     Raises:
         DataError: no run there, or no decision in it.
@@ -53,7 +58,10 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     look = _look(run, streams)
     blocks: list[Block] = [curve_figure(streams, look, run.log.policies)]
     if HINDSIGHT in streams:
-        blocks += [regret_figure(streams, [HINDSIGHT], look), penalty_figure(streams, run.weights, look, np.arange(len(run.chosen))[None])]
+        blocks += [
+            regret_figure(streams, [HINDSIGHT], look),
+            penalty_figure(streams, run.weights, look, np.arange(len(run.chosen))[None], units_of(run.log)),
+        ]
     blocks += [_propensities(run), _chosen_table(run, selector)]
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
@@ -67,7 +75,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     chosen = Chosen(selector, np.arange(len(run.chosen))[None], run.chosen[None], " of this run")
     routes = route_figure(run.log, run.weights, chosen)
     episodes = _episodes(run, scenes(run.log), beside or folder)
-    return Page("Live run", title, _verdict(run, selector, streams), sections, _facts(run), episodes, routes)
+    return Page("Live run", title, _verdict(run, selector, streams, budget), sections, _facts(run), episodes, routes)
 
 
 def run_curve(folder: Path) -> Figure:
@@ -166,48 +174,56 @@ def _chosen_table(run: _Run, selector: str) -> Table:
     return Table("chosen", "What the selector received", caption, columns, rows)
 
 
-def _verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
-    verdict = _own_verdict(run, selector, streams)
-    return verdict if is_recommended(selector) else replace(verdict, sentences=[*verdict.sentences, f"{RECOMMENDATION}."])
-
-
-def _own_verdict(run: _Run, selector: str, streams: dict[str, Stream]) -> Verdict:
+def _verdict(run: _Run, selector: str, streams: dict[str, Stream], budget: int) -> Verdict:
     own = streams[selector]
     reward, success = mean_of(own.reward), rate_of(own.success.T)
     rate = f"95% [{100 * success.low:.0f}, {100 * success.high:.0f}]" if success else ""
     tiles = [
-        Tile("mean reward", f"{reward.value:.3f}" if reward else "–", f"95% {interval(reward)}" if reward else ""),
-        Tile("success", f"{100 * success.value:.0f}%" if success else "–", rate),
+        Tile("mean reward", f"{reward.value:.3f}" if reward else "\u2013", f"95% {interval(reward)}" if reward else ""),
+        Tile("success", f"{100 * success.value:.0f}%" if success else "\u2013", rate),
         *_mean_tiles(own),
     ]
+    hint = [] if is_recommended(selector) else [f"{RECOMMENDATION}."]
     if HINDSIGHT not in streams:
         sentence = "What the other policies would have done is not known: run with --counterfactual to compare."
-        return Verdict(f"{selector} received {reward.value:.3f} a decision" if reward else f"{selector} received nothing", [sentence], tiles)
-    fixed = {name: stream for name, stream in streams.items() if name.startswith("always ")}
-    known = {name: stream.reward[np.isfinite(stream.reward)] for name, stream in fixed.items()}
-    best = max(fixed, key=lambda name: float(known[name].mean()) if known[name].size else -np.inf)
-    differences = own.reward - fixed[best].reward
-    differences = differences[np.isfinite(differences)]
-    if not differences.size:
-        return Verdict(f"{selector} cannot be compared", ["No decision has an outcome of both what was chosen and every other policy."], tiles)
-    rewards = run.log.rewards(run.weights)
-    span = float(np.nanmax(rewards) - np.nanmin(rewards))
+        return Verdict(f"{selector} received {reward.value:.3f} a decision" if reward else f"{selector} received nothing", [sentence, *hint], tiles)
+    found = answer(run.log, run.weights, budget)
+    compared = _compared(run, selector, streams)
+    if found is None or compared is None:
+        return Verdict(f"{selector} cannot be compared", ["No decision has an outcome of both what was chosen and every other policy.", *hint], tiles)
+    return shown_verdict(found, [*compared, *hint], tiles)
+
+
+def _compared(run: _Run, selector: str, streams: Mapping[str, Stream]) -> list[str] | None:
+    """How the run's own selector did against the best single policy, where both are known; None where that is nowhere."""
+    own, fixed = streams[selector], {name: stream for name, stream in streams.items() if name.startswith("always ")}
+    both = np.isfinite(own.reward) & np.isfinite(next(iter(fixed.values())).reward)
+    if not both.any():
+        return None
+    best = max(fixed, key=lambda name: float(fixed[name].reward[both].mean()))
+    differences = (own.reward - fixed[best].reward)[both]
+    span = float(np.ptp(run.log.rewards(run.weights)[np.isfinite(run.log.rewards(run.weights))]))
     low, high = advantage_bounds(differences, span, ERROR / 2.0) if span > 0.0 else (0.0, 0.0)
-    difference = Estimate(float(differences.mean()), low, high)
-    oracle = float(np.nanmean(streams[HINDSIGHT].reward))
-    tiles.append(Tile(f"over {best}", signed(difference.value), f"reward a decision, 95% {interval(difference)}"))
-    tiles.append(Tile("hindsight oracle", f"{oracle:.3f}", "mean reward; optimistic"))
-    return _compared(selector, best, difference, differences.size, tiles)
+    number = f"{len(differences)} decision{'s' if len(differences) > 1 else ''}"
+    units = in_units(f"This run's {selector}", _measures(own, both), best.removeprefix("always "), _measures(fixed[best], both))
+    return [
+        units,
+        f"That is {signed(float(differences.mean()))} reward a decision over {number}, its learning included: between {signed(low)} and "
+        f"{signed(high)} with 95% confidence, however often one looks while the run goes on.",
+    ]
 
 
-def _compared(selector: str, best: str, difference: Estimate, compared: int, tiles: list[Tile]) -> Verdict:
-    over = f"{signed(difference.value)} reward a decision over {compared} compared decisions, with 95% confidence within {interval(difference)}"
-    hint = "The bounds allow for a selector that learns as it goes. One run is one stream: osel_sim.replay on a rollout log compares over many."
-    if difference.low > 0.0:
-        return Verdict(f"{selector} is ahead of {best}", [f"{over}.", hint], tiles, "good")
-    if difference.high < 0.0:
-        return Verdict(f"{selector} is behind {best}", [f"{over}: what it paid so far to find out.", hint], tiles, "bad")
-    return Verdict(f"Too early to tell {selector} from {best}", [f"{over}: that may as well be nothing.", hint], tiles)
+def _measures(stream: Stream, rows: NDArray[np.bool_]) -> dict[str, float | None]:
+    def mean(values: Array) -> float | None:
+        known = values[rows][np.isfinite(values[rows])]
+        return float(known.mean()) if known.size else None
+
+    seconds = mean(stream.seconds)
+    return {
+        "success_rate": mean(stream.success),
+        "mean_price": mean(stream.price),
+        "mean_seconds": seconds if seconds is not None and seconds >= FLOOR_SECONDS else None,
+    }
 
 
 def _mean_tiles(stream: Stream) -> list[Tile]:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.estimate import Estimate, mean_of, over_instances, rate_of
+from osel_sim.analysis.estimate import Estimate, rate_of
 from osel_sim.analysis.log import Array
+from osel_sim.analysis.streamed import over_units
 from osel_sim.reporting.areas import stacked
 from osel_sim.reporting.charts import Figure, Look, Panel, listed
 from osel_sim.reporting.curves import Line, curves, settled_domain, thinned
@@ -122,18 +123,18 @@ def penalty_figure(
     weights: RewardWeights,
     look: Look,
     instances: NDArray[Any],
-    always: Mapping[str, tuple[Estimate | None, Estimate | None]] | None = None,
+    units: NDArray[np.int64],
 ) -> Figure:
     """Success against the weighted sum of time and price (paper, figure 6).
 
     Args:
         instances: (S, T), which instance was decided on.
-        always: score and penalty of fixed policies, from a log that has more repeats than the streams drew.
+        units: (N,) of the instances.
     """
     label, scale = score_label(weights)
     dots: list[Dot] = []
     for name, stream in streams.items():
-        score, penalty = (always or {}).get(name) or (_mean_over(stream.score, instances), _mean_over(stream.penalty, instances))
+        score, penalty = (_mean_over(values, instances, units) for values in (stream.score, stream.penalty))
         if score is not None and penalty is not None:
             dots.append(Dot(name, penalty, Estimate(scale * score.value, scale * score.low, scale * score.high)))
     caption = (
@@ -198,12 +199,15 @@ def gap_figure(gaps: Mapping[str, tuple[Estimate | float | None, Estimate | floa
     return Figure("gap_closed", "Share of the learnable gap closed", caption, text, [panel])
 
 
-def _mean_over(values: Array, instances: NDArray[Any]) -> Estimate | None:
-    """Mean over decisions and seeds (S, T) with its interval over instances; of yes and no in a single stream Wilson's."""
+def _mean_over(values: Array, instances: NDArray[Any], units: NDArray[np.int64]) -> Estimate | None:
+    """Mean over decisions and seeds (S, T) with its interval over units; of yes and no in a single stream Wilson's."""
     known = values[np.isfinite(values)]
     if len(values) == 1 and np.isin(known, (0.0, 1.0)).all():
-        return rate_of(values.T)
-    return mean_of(values) if len(values) == 1 else over_instances(values, instances)
+        return rate_of(values.T, units[instances[0]])
+    found = over_units(values, instances, units)
+    if found is None:
+        return None
+    return Estimate(found.mean, *found.interval()) if found.units > 1 else certain(found.mean)
 
 
 def _lines(values: Mapping[str, Array], most: int = 100) -> tuple[NDArray[np.int64], list[Line]]:

@@ -20,6 +20,8 @@ LOOK = 0.5
 """Seconds between looks at the folder."""
 SHARE, LONGEST = 0.2, 8.0
 """Making pages takes that share of a core at most, but one is never older than so many seconds if there is a newer decision."""
+REPLAYED = 2_000
+"""Decisions that are replayed for the verdict of a page that the next decision outdates."""
 LINGER = 3.0
 """Seconds that the last page is served for after the run, for browsers that still look at it."""
 HOST = "127.0.0.1"
@@ -92,7 +94,7 @@ class WatchedPage:
                 film = None if last is None else self._film_of(last.index, last.policy)
                 words = "" if last is None else f"Decision {last.index + 1}, {last.policy}: {last.instruction}"
                 live = Live(self.version + 1, FILM if film else "", words, len(decisions), over)
-                self.html, self.film, self.version = to_html(run_page(self.folder), live).encode(), film, self.version + 1
+                self.html, self.film, self.version = to_html(run_page(self.folder, budget=REPLAYED), live).encode(), film, self.version + 1
         except (OselError, OSError) as error:  # such as a run folder that is being changed by hand
             self.html, self.version = waiting_html(self.folder, Live(self.version + 1), str(error)).encode(), self.version + 1
         self._seen, self._made, self._cost = size, time.monotonic(), time.thread_time() - start
