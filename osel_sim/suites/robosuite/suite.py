@@ -19,7 +19,9 @@ HORIZON = 500
 FINGERS = {"Panda": 2, "UR5e": 6, "IIWA": 6, "Jaco": 6, "Kinova3": 6}
 """Arm -> joints of the gripper that robosuite gives it. Sawyer is not among them: its meshes do not load in MuJoCo 3.9."""
 USUAL = "Panda"
-CAMERAS = {"agentview": "agentview", "wrist": "robot0_eye_in_hand", "frontview": "frontview", "sideview": "sideview", "birdview": "birdview"}
+STOCK = ("IIWA",)
+"""Arms whose actions are given in a frame that moves with a joint: robosuite's own control steps them, at its own speed and without snapshots."""
+CAMERAS = {"agentview": "agentview", "wrist": "robot0_eye_in_hand", "frontview": "frontview", "birdview": "birdview"}
 """Name of a camera -> robosuite's."""
 
 
@@ -38,9 +40,7 @@ class Robosuite:
     def tasks(self) -> Mapping[str, TaskInfo]:
         """Every environment with every arm; the Panda's need not be named."""
         return {
-            _task(name, arm): TaskInfo(
-                entry["title"], entry.get("horizon", HORIZON), f"1-{content_digest(repr(entry))[:12]}", (arm.lower(),), robot=arm
-            )
+            _task(name, arm): TaskInfo(entry["title"], entry.get("horizon", HORIZON), f"1-{content_digest(repr(entry))[:12]}", (arm.lower(),))
             for arm in FINGERS
             for name, entry in _words().items()
         }
@@ -81,7 +81,7 @@ def specification(task: str) -> EnvironmentSpec:
         context_camera="agentview",
         robot=arm,
         horizon=_words()[name].get("horizon", HORIZON),
-        snapshots=True,
+        snapshots=arm not in STOCK,
     )
 
 
