@@ -17,7 +17,7 @@ from osel_sim.sim.gl import quiet_robosuite
 from osel_sim.sim.light_meshes import lighten
 from osel_sim.suites.base import BaseEnvironment, PlainInstance
 from osel_sim.suites.mujoco_view import MujocoView
-from osel_sim.suites.robosuite.suite import CAMERAS, STOCK, parts, specification
+from osel_sim.suites.robosuite.tasks import CAMERAS, STOCK, parts, specification
 
 SHOWN = (1, 2)
 """Geom groups; robosuite's collision geoms are in group 0."""
