@@ -11,8 +11,9 @@ from typing import Annotated, Literal
 
 import pytest
 
-from osel_sim.__main__ import COMMANDS, main, module
+from osel_sim.__main__ import COMMANDS, main
 from osel_sim.api.settings import MAIN, Count, Folder, Index, Levels, NonNegative, Settings, settings
+from osel_sim.cli import suites_command
 from osel_sim.cli.command import BROKEN_PIPE, Command, reported
 from osel_sim.core.docstrings import field_docstrings
 from osel_sim.core.errors import SettingError, UnknownNameError, UsageError
@@ -124,10 +125,10 @@ def test_a_configuration_is_checked_where_it_is_made_and_survives_json() -> None
 
 def commands_of(name: str) -> list[Command]:
     """The commands of that name: `train` and `suites` are two each."""
-    found = vars(import_module(module(name)))
-    if isinstance(found["main"], Command):
-        return [found["main"]]
-    return list(found["commands"].values()) if name == "suites" else [found["policy_command"], found["encoder_command"]]
+    if name == "suites":
+        return list(suites_command.commands.values())
+    found = vars(import_module(f"osel_sim.{name}"))
+    return [found["main"]] if isinstance(found["main"], Command) else [found["policy_command"], found["encoder_command"]]
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -1,5 +1,6 @@
 """LinUCB, linear Thompson sampling, neural-linear and `auto`: they learn what can be learned, and nothing breaks them."""
 
+import math
 from itertools import pairwise, product
 from pathlib import Path
 
@@ -208,6 +209,7 @@ def test_updates_may_lag_behind(name):
         ("auto", {"components": 0}),
         ("auto", {"width": 0.0}),
         ("auto", {"optimism": -1.0}),
+        ("auto", {"alarm": 1.0}),
         ("auto", {"chance": float("nan")}),
         ("auto", {"signals": ()}),
         ("linucb", {"signals": (0.0,)}),
@@ -346,3 +348,24 @@ def test_evidence_says_which_part_of_a_context_is_used(decisive, used):
 def test_parts_that_are_none(parts):
     with pytest.raises(UsageError, match="parts"):
         make_selector("auto", ("a", "b"), 40, seed=0, parts=parts)
+
+
+def test_a_change_that_nobody_announced_is_noticed_and_what_was_before_forgotten():
+    generator = np.random.default_rng(0)
+    contexts = generator.normal(size=(700, 8)).astype(np.float32)
+    rates = np.where(np.arange(700)[:, None] < 400, [0.8, 0.5, 0.4], [0.2, 0.5, 0.4])
+    rewards = (generator.random(rates.shape) < rates).astype(float)
+    late = {}
+    for alarm in (1e4, math.inf):
+        selector = make_selector("auto", POLICIES, 8, seed=0, alarm=alarm)
+        late[alarm] = (play(selector, contexts, 30.0 * rewards + 5.0)[-150:] == 0).mean()
+        assert (len(selector.state_dict()["targets"]) < 400) == math.isfinite(alarm)
+    assert late[1e4] < 0.1 and late[math.inf] > 0.3
+
+
+def test_where_nothing_changes_nothing_is_forgotten():
+    for seed in range(4):
+        contexts, rewards, _ = clusters(seed, 300)  # what is chosen changes while it is learned, and with it what each policy earns
+        selector = make_selector("auto", POLICIES, 40, seed=seed)
+        play(selector, contexts, rewards)
+        assert len(selector.state_dict()["targets"]) == 300
