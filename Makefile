@@ -1,4 +1,4 @@
-# make run | test | slow | stock | lint | docs | bench | policies | wheel | schemas | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
+# make run | suites | test | slow | stock | lint | docs | bench | policies | wheel | schemas | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
@@ -17,7 +17,7 @@ EPISODES ?= 240
 INSTANCES ?= 50
 POLICIES := local_small remote_specialist remote_base remote_large
 
-.PHONY: run test slow stock lint docs bench policies wheel schemas requirements environment clean
+.PHONY: suites run test slow stock lint docs bench policies wheel schemas requirements environment clean
 
 run: $(READY)
 	$(PYTHON) -m osel_sim.run --task pick_place --policies local_small remote_large --counterfactual --video 3 --out $(OUT) $(ARGS)
@@ -74,6 +74,15 @@ schemas: $(READY)
 requirements: $(READY)
 	.venv/bin/uv pip compile --group dev pyproject.toml --quiet --no-annotate --no-header --no-emit-index-url --universal --python-version 3.12 \
 		--output-file requirements.txt $(ARGS)
+	@mkdir -p build && grep -v -E '^(mujoco|robosuite)==' requirements.txt > build/constraints.txt
+	for list in osel_sim/suites/pins/*.in; do \
+		.venv/bin/uv pip compile $$list --constraint build/constraints.txt --override osel_sim/suites/pins/overrides.txt --quiet --no-annotate --no-header \
+			--no-emit-index-url --universal --python-version 3.12 --output-file $${list%.in}.txt $(ARGS) || exit 1; \
+	done
+
+# The Python environments of suites of others, in the user's cache folder; tests of a suite are skipped where its environment is missing.
+suites: $(READY)
+	$(PYTHON) -m osel_sim.suites install metaworld gym lerobot
 
 environment: $(READY)
 

@@ -56,9 +56,9 @@ def measure_ppo(options: argparse.Namespace) -> dict[str, float]:
     theirs = ours = 0.0
     with _one_thread():
         for seed in range(options.sb3_seeds):
-            theirs += timed(partial(sb3, contexts, rewards, seed)) - timed(partial(sb3, contexts[:5], rewards[:5], seed))
-            ours += timed(partial(replay_one, "ppo", contexts, rewards, POLICIES, seed))
-            ours -= timed(partial(replay_one, "ppo", contexts[:5], rewards[:5], POLICIES, seed))
+            theirs += own_time(partial(sb3, contexts, rewards, seed)) - own_time(partial(sb3, contexts[:5], rewards[:5], seed))
+            ours += own_time(partial(replay_one, "ppo", contexts, rewards, POLICIES, seed))
+            ours -= own_time(partial(replay_one, "ppo", contexts[:5], rewards[:5], POLICIES, seed))
     few, all_seeds = options.sb3_seeds * options.decisions, options.seeds * options.decisions
     together = in_processes(options) / all_seeds if options.workers > 1 else ours / few
     print(
@@ -98,8 +98,8 @@ def measure_bound(options: argparse.Namespace) -> dict[str, float]:
     towers = [network.actor[:3], network.critic[:3]]
     epochs, memory = [], []
     for _ in range(40):
-        epochs.append(timed(partial(FastPPO(selector).run, contexts, rewards), time.process_time) / 10)
-        memory.append(timed(lambda: [touch(*tower) for tower in towers], time.process_time))
+        epochs.append(own_time(partial(FastPPO(selector).run, contexts, rewards)) / 10)
+        memory.append(own_time(lambda: [touch(*tower) for tower in towers]))
     size = sum(array.nbytes for tower in towers for array in tower)
     epoch, pass_over = min(epochs[1:]), min(memory[1:])
     print(f"one epoch of PPO on a rollout: {1e3 * epoch:.2f} ms; reading and writing its {size / 1e6:.0f} MB once: {1e3 * pass_over:.2f} ms")
@@ -120,7 +120,7 @@ def measure_auto(options: argparse.Namespace) -> dict[str, float]:
     told = {"expected_costs": log.expected_costs(weights)} | ({} if log.skills is None else {"skills": log.skills})
     with _one_thread():
         replay_one("auto", contexts[:50], rewards[:50], log.policies, 0, **told)
-        seconds = timed(lambda: replay_one("auto", contexts, rewards, log.policies, 0, **told), time.process_time)
+        seconds = own_time(lambda: replay_one("auto", contexts, rewards, log.policies, 0, **told))
     print(f"auto: {len(log) / seconds:.0f} decisions/s, {len(log)} of them between {len(log.policies)} policies")
     return {"auto_decisions_per_second": len(log) / seconds}
 
@@ -175,7 +175,7 @@ def sb3(contexts, rewards, seed: int):
 
 def in_processes(options: argparse.Namespace) -> float:
     """Seconds that the replays of a log take."""
-    from osel_sim.analysis.engine import Part, Setup, replay
+    from osel_sim.analysis.engine import Setup, replay
     from osel_sim.analysis.log import read_log
     from osel_sim.context.cache import ContextCache
     from osel_sim.formats.rollout_log import Row, write_rollouts
@@ -207,14 +207,18 @@ def in_processes(options: argparse.Namespace) -> float:
         write_rollouts(folder, rows, {"encoder": "made_up@1"})
         log = read_log(folder)
 
-    part = Part(log, [Setup(RewardWeights(0.0, 0.0))], ["ppo"], range(options.seeds), options.decisions)
-    return timed(lambda: list(replay([part], options.workers)))
+    return timed(lambda: replay(log, [Setup(RewardWeights(0.0, 0.0))], ["ppo"], range(options.seeds), options.decisions, options.workers))
 
 
 def timed(function: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
     start = clock()
     function()
     return clock() - start
+
+
+def own_time(function: Callable[[], object]) -> float:
+    """CPU seconds of this process, one thread of which works: what others do on the machine counts little."""
+    return timed(function, time.process_time)
 
 
 if __name__ == "__main__":

@@ -8,21 +8,25 @@ decisions and in successes: below 0 where a selector gains by the context. A see
 the best by more than 0.05, or, where the context matters, if that quarter came to 0.05 less a decision than the best single policy.
 
 A log's instances come in a random order, those of `--half` only, with `--preset`'s rewards, and at most 3,000 of them. Settings of `auto` were chosen
-on seeds below 1000 of like problems and on the choosing half of `assets/logs/suite`; the default seeds had no part in that.
+on like problems drawn from other seeds and on the choosing half of `assets/logs/suite`; the default seeds had no part in that.
 
-The last line is JSON: by selector the mean regret per 1000 decisions, the shares of stuck seeds and of problems on which no other of the selectors is
-ahead beyond the error, and the milliseconds of one decision with its update; by problem the regrets.
+With `--results FILE` every seed is written there as soon as it was played, and what is there is not played again: a benchmark that was cut off,
+or one of more seeds, goes on. Seeds come in turn, so an early end leaves some of every problem. Begin a new file after a change of the code.
+
+It prints a table in Markdown: regret ± standard error. The last line is JSON: by selector the mean regret per 1000 decisions, the shares of stuck
+seeds and of problems on which no other of the selectors is ahead beyond the error, and the milliseconds of one decision with its update; by problem
+what the best single policy has, and of each selector the regret, its standard error and the share of stuck seeds.
 """
 
 import argparse
 import json
 import os
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from functools import cache, partial
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +35,12 @@ from selection_problems import PROBLEMS, Problem, names
 from osel_sim.core.progress import progress
 from osel_sim.selection.registry import make_selector, wanted_of
 
+OVERALL = {
+    "regret_per_1000": "regret per 1000 decisions",
+    "stuck": "share of stuck seeds",
+    "unbeaten": "share of problems on which none is ahead",
+    "milliseconds": "milliseconds a decision",
+}
 CLOSE = 0.05 + 1e-9
 """A policy that is worse by no more than this is not worth finding."""
 
@@ -40,15 +50,26 @@ class Played:
     """What came of one selector on one problem of one seed.
 
     Attributes:
-        regret: to the best single policy, in successes, over all decisions.
+        best: what the best single policy has, in successes, over all decisions.
+        regret: to that policy.
         stuck: see the module.
         milliseconds: of one decision with its update.
     """
 
+    best: float
     regret: float
     stuck: bool
     milliseconds: float
     decisions: int
+
+
+@dataclass(frozen=True)
+class Job:
+    """One seed of a problem, and who plays it."""
+
+    problem: str
+    seed: int
+    selectors: tuple[str, ...]
 
 
 def make_problem(name: str, seed: int, half: str | None, preset: str) -> Problem:
@@ -81,12 +102,12 @@ def play(name: str, problem: Problem, seed: int) -> Played:
     lost = (problem.expected[:, means.argmax()] - problem.expected[np.arange(decisions), chosen]) / problem.scale
     last = slice(decisions * 3 // 4, None)
     stuck = (means[chosen[last]] < means.max() - CLOSE * problem.scale).mean() > 0.5 if problem.context_free else lost[last].mean() > CLOSE
-    return Played(float(lost.sum()), bool(stuck), milliseconds, decisions)
+    return Played(float(means.max()) * decisions / problem.scale, float(lost.sum()), bool(stuck), milliseconds, decisions)
 
 
-def _job(job: tuple[str, int], selectors: list[str], half: str | None, preset: str) -> dict[str, Played]:
-    problem = make_problem(*job, half, preset)
-    return {name: play(name, problem, job[1]) for name in selectors}
+def _job(job: Job, half: str | None, preset: str) -> list[Played]:
+    problem = make_problem(job.problem, job.seed, half, preset)
+    return [play(name, problem, job.seed) for name in job.selectors]
 
 
 @cache
@@ -94,10 +115,10 @@ def _log(folder: str, half: str | None, preset_name: str) -> tuple[NDArray[np.fl
     """Contexts (N, D), rewards (N, P, R), expected costs (P,) and skills of a log's complete instances."""
     import osel_sim as osel
     from osel_sim.analysis.streams import complete_instances
-    from osel_sim.selection.reward import preset
+    from osel_sim.selection.reward import RewardWeights, preset
     from osel_sim.selection.skills import Skills
 
-    weights = preset(preset_name)
+    weights = RewardWeights(0.0, 0.0) if preset_name == "success" else preset(preset_name)
     log = osel.load_log(folder)
     mine = log.half(half) if half else np.ones(len(log), bool)
     costs = (log.take(~mine) if half else log).expected_costs(weights)
@@ -107,17 +128,29 @@ def _log(folder: str, half: str | None, preset_name: str) -> tuple[NDArray[np.fl
     return log.contexts, log.rewards(weights), np.array([costs[policy] for policy in log.policies]), skills
 
 
-def _results(options: argparse.Namespace, problems: list[str]) -> Iterator[tuple[str, dict[str, list[Played]]]]:
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
-    job = partial(_job, selectors=options.selectors, half=options.half, preset=options.preset)
-    with ProcessPoolExecutor(options.workers) as pool, progress(len(problems) * len(seeds), "seed", "selection") as bar:
-        futures = {name: [pool.submit(job, (name, seed)) for seed in seeds] for name in problems}
-        for name, own in futures.items():
-            played = []
-            for future in own:
-                played.append(future.result())
-                bar.update(1)
-            yield name, {selector: [results[selector] for results in played] for selector in options.selectors}
+def play_all(jobs: list[Job], options: argparse.Namespace) -> dict[tuple[str, int, str], Played]:
+    """What came of each problem, seed and selector; those of `options.results` are not played again."""
+    path: Path | None = options.results
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True) if path and path.exists() else []
+    whole = [line for line in lines if line.endswith("\n")]  # the last may have been cut off
+    done = {(row["problem"], row["seed"], row["selector"]): Played(**row["played"]) for row in map(json.loads, whole)}
+    jobs = [Job(job.problem, job.seed, tuple(name for name in job.selectors if (job.problem, job.seed, name) not in done)) for job in jobs]
+    jobs = [job for job in jobs if job.selectors]
+    if path:
+        path.write_text("".join(whole), encoding="utf-8")
+    with ProcessPoolExecutor(options.workers) as pool, progress(len(jobs), "seed", "selection") as bar:
+        futures = {pool.submit(_job, job, options.half, options.preset): job for job in jobs}
+        for future in as_completed(futures):
+            job = futures[future]
+            rows = []
+            for name, played in zip(job.selectors, future.result(), strict=True):
+                done[job.problem, job.seed, name] = played
+                rows.append(json.dumps({"problem": job.problem, "seed": job.seed, "selector": name, "played": asdict(played)}) + "\n")
+            if path:
+                with path.open("a", encoding="utf-8") as file:
+                    file.writelines(rows)
+            bar.update(1)
+    return done
 
 
 def main() -> None:
@@ -126,42 +159,55 @@ def main() -> None:
     parser.add_argument("--problems", nargs="*", choices=list(PROBLEMS), metavar="NAME", help="default: all")
     parser.add_argument("--logs", nargs="*", default=[], help="folders of rollout logs; alone, no made-up problem is played")
     parser.add_argument("--half", choices=("choose", "score"))
-    parser.add_argument("--preset", default="oxe")
+    parser.add_argument("--preset", default="oxe", help="of rewards; success for success alone")
     parser.add_argument("--seeds", type=int, default=50)
     parser.add_argument("--first-seed", type=int, default=2000)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--results", type=Path, help="a file for what was played, to go on from")
     options = parser.parse_args()
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")  # of the workers: they share the cores
     made = options.problems if options.problems is not None else [] if options.logs else list(PROBLEMS)
     problems = [*made, *(str(Path(log)) for log in options.logs)]
-    print(f"{'':34s}" + "".join(f"{name:>22s}" for name in options.selectors))
-    regrets: dict[str, dict[str, float]] = {}
-    stuck = {name: list[bool]() for name in options.selectors}
-    milliseconds = {name: list[float]() for name in options.selectors}
-    per_decision = {name: list[float]() for name in options.selectors}
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    played = play_all([Job(problem, seed, tuple(options.selectors)) for seed in seeds for problem in problems], options)
+    print(f"\n| problem | decisions | best single | {' | '.join(options.selectors)} |\n|---|---|---|{'---|' * len(options.selectors)}")
+    found: dict[str, dict[str, Any]] = {}
     unbeaten = dict.fromkeys(options.selectors, 0)
-    for problem, played in _results(options, problems):
-        values = {name: np.array([one.regret for one in own]) for name, own in played.items()}
-        errors = {name: float(own.std(ddof=1) / np.sqrt(len(own))) if len(own) > 1 else 0.0 for name, own in values.items()}
-        regrets[problem] = {name: round(float(own.mean()), 2) for name, own in values.items()}
-        for name, own in played.items():
-            stuck[name] += [one.stuck for one in own]
-            milliseconds[name].append(float(np.mean([one.milliseconds for one in own])))
-            per_decision[name].append(float(np.mean([1e3 * one.regret / one.decisions for one in own])))
-            ahead = [values[name] - values[other] for other in options.selectors if other != name]
-            unbeaten[name] += all(gap.mean() <= 1.96 * gap.std(ddof=1) / np.sqrt(len(gap)) for gap in ahead)
-        cells = (f"{regrets[problem][name]:9.1f} ±{errors[name]:5.1f} {100 * np.mean([one.stuck for one in played[name]]):3.0f}%" for name in played)
-        print(f"{problem[-34:]:34s}" + "".join(f"{cell:>22s}" for cell in cells), flush=True)
-    found = {
+    for problem in problems:
+        own = {name: [played[problem, seed, name] for seed in seeds] for name in options.selectors}
+        regrets = {name: np.array([one.regret for one in ones]) for name, ones in own.items()}
+        some = own[options.selectors[0]]
+        found[problem] = {"decisions": some[0].decisions, "best_single": round(float(np.mean([one.best for one in some])), 2)}
+        for name, ones in own.items():
+            stuck = float(np.mean([one.stuck for one in ones]))
+            figures = {"regret": regrets[name].mean(), "error": _error(regrets[name]), "stuck": stuck}
+            found[problem][name] = {key: round(float(value), 4) for key, value in figures.items()}
+            ahead = [regrets[name] - regrets[other] for other in options.selectors if other != name]
+            unbeaten[name] += all(gap.mean() <= 1.96 * _error(gap) for gap in ahead)
+        cells = (_cell(found[problem][name]) for name in options.selectors)
+        print(f"| {Path(problem).name} | {some[0].decisions} | {found[problem]['best_single']:.0f} | {' | '.join(cells)} |")
+    overall = {
         name: {
-            "regret_per_1000": round(float(np.mean(per_decision[name])), 2),
-            "stuck": round(float(np.mean(stuck[name])), 4),
+            "regret_per_1000": round(float(np.mean([1e3 * own[name]["regret"] / own["decisions"] for own in found.values()])), 2),
+            "stuck": round(float(np.mean([own[name]["stuck"] for own in found.values()])), 4),
             "unbeaten": round(unbeaten[name] / len(problems), 3),
-            "milliseconds": round(float(np.mean(milliseconds[name])), 3),
+            "milliseconds": round(float(np.mean([played[problem, seed, name].milliseconds for problem in problems for seed in seeds])), 3),
         }
         for name in options.selectors
     }
-    print(json.dumps({"selectors": found, "regrets": regrets}))
+    for key, heading in OVERALL.items():
+        print(f"| {heading} | | | {' | '.join(f'{own[key]:g}' for own in overall.values())} |")
+    print(json.dumps({"selectors": overall, "problems": found}))
+
+
+def _cell(own: dict[str, float]) -> str:
+    """Regret, its standard error, and the share of stuck seeds where there are any."""
+    return f"{own['regret']:.1f} ± {own['error']:.1f}" + (f" ({own['stuck']:.0%} stuck)" if own["stuck"] else "")
+
+
+def _error(values: NDArray[np.float64]) -> float:
+    """Standard error of the mean."""
+    return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
 
 
 if __name__ == "__main__":

@@ -129,6 +129,12 @@ def drift(decisions: int, generator: np.random.Generator, dim: int = 64) -> Prob
     return _drawn(generator.normal(size=(decisions, dim)) / np.sqrt(dim), rates, generator)
 
 
+def change(decisions: int, generator: np.random.Generator, dim: int = 64) -> Problem:
+    """Halfway the best of three policies becomes the worst; the context says nothing of it."""
+    rates = np.where(np.arange(decisions)[:, None] < decisions // 2, [0.8, 0.6, 0.4], [0.3, 0.6, 0.4])
+    return _drawn(generator.normal(size=(decisions, dim)) / np.sqrt(dim), rates, generator)
+
+
 def repeats(texts: int, each: int, generator: np.random.Generator, dim: int = 128) -> Problem:
     """The same few contexts again and again, with rates of their own."""
     contexts = generator.normal(size=(texts, dim)) / np.sqrt(dim)
@@ -155,8 +161,10 @@ PROBLEMS: dict[str, Make] = {
             ((0.64, 0.86), 1000, 3),
             ((0.8, 0.9), 600, 0),
             ((0.95, 0.99), 1000, 0),
+            ((0.5, 0.55), 5000, 0),
             ((0.1, 0.1, 0.2), 1000, 0),
             ((0.4, 0.5, 0.6), 1500, 0),
+            ((0.9, 0.95, 0.99), 3000, 0),
             ((), 400, 0),
         )
     },
@@ -177,5 +185,6 @@ PROBLEMS: dict[str, Make] = {
     "clusters, false skills": partial(clusters, 1500, count=10, skills="false"),
     "exclusive or": partial(exclusive_or, 2000),
     "drift": partial(drift, 2000),
+    "change": partial(change, 2000),
     "repeated texts": partial(repeats, 60, 20),
 }

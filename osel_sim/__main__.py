@@ -22,17 +22,12 @@ COMMANDS = {
 }
 
 
-def module(command: str) -> str:
-    """The module of a command: `osel_sim.COMMAND`, but for `suites`, which is a package."""
-    return "osel_sim.cli.suites_command" if command == "suites" else f"osel_sim.{command}"
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; the exit code."""
     this_python.check()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and words[0] in COMMANDS:
-        code: int = import_module(module(words[0])).main(words[1:])
+        code: int = import_module(f"osel_sim.{words[0]}").main(words[1:])
         return code
     if words and words[0] == "--install-completion":
         return _install_completion()
@@ -56,12 +51,12 @@ def _install_completion() -> int:
 
     app = App(name="osel-sim", version_flags=[])
     for name in COMMANDS:
-        command = import_module(module(name))
-        if name == "suites":
+        if name == "suites":  # two commands below one name
             app.command(App(name=name), name=name)
-            for action, one in command.commands.items():
+            for action, one in import_module("osel_sim.cli.suites_command").commands.items():
                 app[name].command(one.app(action), name=action)
             continue
+        command = import_module(f"osel_sim.{name}")
         found = command.main if isinstance(command.main, Command) else command.policy_command
         app.command(found.app(name), name=name)
 

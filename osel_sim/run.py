@@ -16,7 +16,8 @@ EXAMPLES = """examples:
   python -m osel_sim.run --task tag:short --level 0 2 --episodes 200       # several tasks and levels, mixed
   python -m osel_sim.run --task all --level 0 2 --selector auto --encoder osel_suite --warm-start assets/logs/suite   # it has seen a log's outcomes
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
-  python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first --resume
+  python -m osel_sim.run --out runs/first --resume                         # goes on with it, if it was cut off
+  python -m osel_sim.run --out runs/first --resume --episodes 200          # and on, to more decisions
   python -m osel_sim.run --config runs/first/run.json --seed 1 --out runs/second   # another run with the same settings
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
@@ -47,7 +48,7 @@ def _print_next(config: RunConfig, result: "RunResult") -> None:
 
     folder, steps = result.folder, list[Step]()
     if result.interrupted:
-        steps.append(("goes on with it", "run", ["--config", folder / RUN, "--resume"]))
+        steps.append(("goes on with it", "run", ["--out", folder, "--resume"]))
     elif result.journal:
         steps.append(("shows its page", "report", [folder, "--open"]))
         steps.append(("estimates what other choices would have earned", "replay", [folder]))

@@ -82,9 +82,10 @@ def test_a_live_run_of_objects_of_ones_own(tmp_path, capsys):
     ]
     settings = {"task": "short", "tasks": world / "tasks", "policies": policies, "selector": Greedy, "out": tmp_path / "run"}
     osel.run(**settings, episodes=1, no_page=True)
-    with pytest.raises(osel.OselError, match="episodes was 1 at the beginning"):
-        osel.run(**settings, episodes=2, resume=True)
-    result = osel.run(**{**settings, "out": tmp_path / "two"}, episodes=2, seed=1)
+    assert len(osel.run(**settings, episodes=2, resume=True, no_page=True).decisions) == 2
+    with pytest.raises(osel.OselError, match="episodes was 2 at the beginning"):
+        osel.run(**settings, episodes=1, resume=True)
+    result = osel.run(**{**settings, "out": tmp_path / "two"}, episodes=2, seed=1, no_page=True)
     assert list(result.decisions["policy"]) == ["still", "calm"]  # what it has not tried it takes for the best
     assert list(result.decisions["price"]) == pytest.approx([0.0, 3.0]) and not result.interrupted
     assert (tmp_path / "run" / "episodes.jsonl").read_text() and not (tmp_path / "run" / "selector.safetensors").exists()

@@ -66,7 +66,7 @@ def test_a_workflow_gives_inputs_that_the_action_has():
 
 @pytest.mark.slow
 def test_all_steps_in_their_order(tmp_path):
-    inputs = {"policy": "scripted_expert", "policies_dir": str(ROOT / "policies"), "task": "lift", "instances": "2"}
+    inputs = {"policy": "scripted_expert", "policies_dir": str(ROOT / "policies"), "task": "lift", "instances": "2", "until_decided": "true"}
     for round in range(2):
         for name in STEPS:
             if name not in NOT_HERE:

@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 
+from osel_sim.collect import main as collect_main
 from osel_sim.core import content
 from osel_sim.formats.task_file import load_task_file
 from osel_sim.sim.env import TaskEnv
@@ -50,7 +51,7 @@ def test_a_shard_is_a_lerobot_dataset_of_what_the_expert_did(tmp_path):
     assert record_shard(Shard(TASK, tmp_path / "shard", 0, 2, 48, (0,))) == (frames, episodes, failed)
 
 
-def test_wrong_input_is_one_line(tmp_path):
+def test_wrong_input_is_one_line(tmp_path, capsys):
     used = tmp_path / "used"
     used.mkdir()
     for arguments, message in (
@@ -58,8 +59,9 @@ def test_wrong_input_is_one_line(tmp_path):
         (("--episodes", 1, "--out", used), "--resume"),
         (("--episodes", 1, "--out", tmp_path / "a", "--tasks", tmp_path / "no"), "folder"),
     ):
-        done = collect(*arguments)
-        assert done.returncode == 2 and message in done.stderr and done.stderr.count("\n") == 1
+        assert collect_main(["--task", "pick_place", *map(str, arguments)]) == 2
+        told = capsys.readouterr().err
+        assert message in told and told.count("\n") == 1
 
 
 @pytest.mark.slow

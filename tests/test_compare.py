@@ -1,13 +1,18 @@
 """Comparing policies: pairing, what is claimed of it, what is written, and what CI is told."""
 
+import importlib.util
 import json
+import os
+import sys
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from report_helpers import FAR, made_run
 from synthetic_log import make_row
 
 import osel_sim as osel
@@ -16,6 +21,8 @@ from osel_sim.analysis.comparison import _verdict
 from osel_sim.analysis.pairing import Contender, Pairs
 from osel_sim.core.errors import DataError, SettingError, UnknownNameError, UsageError
 from osel_sim.formats.rollout_log import Row, write_rollouts
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def rows_of(policy: str, successes: Iterable[object], task: str = "lift", first: int = 0, repeat: int = 0, **values) -> list[Row]:
@@ -138,6 +145,53 @@ def test_pairs_of_other_scenes_are_refused_by_name_and_unknown_ones_said(tmp_pat
     assert half.result["pairs"][0]["same_scene"] == 15 and "tell the scenes of 5 of them" in (tmp_path / "half.md").read_text()
     osel.compare(one, log_of(tmp_path / "old", second), markdown=tmp_path / "old.md")
     assert "Paired by key alone" in (tmp_path / "old.md").read_text()
+
+
+def test_live_runs_are_compared_by_what_they_chose_and_by_all_outcomes(tmp_path):
+    whole, chosen = made_run(tmp_path / "whole"), made_run(tmp_path / "chosen", counterfactual=False)
+    found = osel.compare(whole)
+    (entry,) = found.result["pairs"]
+    assert (entry["instances"], sum(entry["errors"].values()), sum(entry["unpaired"].values())) == (39, 1, 1)
+    assert found.result["reward"]["alpha_time"] == 0.1, "the run's own weights"
+    assert osel.compare(whole, preset="mmlu").result["reward"]["alpha_time"] == 0.03
+    same = osel.compare(whole, chosen, policies=FAR)
+    (entry,) = same.result["pairs"]
+    assert (same.result["policies"][1]["name"], entry["flips"], entry["test"]["p"]) == (f"{FAR}@{chosen}", [], 1.0)
+    assert entry["unpaired"]["first"] > 0 == entry["unpaired"]["second"] and entry["instances"] < 39
+    with pytest.raises(DataError, match="no instance in common"):
+        osel.compare(chosen)
+    other = chosen / "episodes.jsonl"
+    lines = [json.loads(line) for line in other.read_text().splitlines()]
+    for name, folder in (("here", whole), ("there", chosen)):
+        (folder / "episodes.jsonl").write_text("".join(json.dumps(line | {"scene": f"{name}{line['index']}"}) + "\r\n" for line in lines))
+    with pytest.raises(DataError, match=r"is not the same scene in .*whole and in .*chosen"):
+        osel.compare(whole, chosen, policies=FAR)
+
+
+def test_logs_of_nothing_but_errors_of_other_levels_or_of_other_robots_are_not_compared(tmp_path):
+    right = log_of(tmp_path / "right", rows_of("a", [True] * 20))
+    for name, rows in (
+        ("errors", rows_of("b", [False] * 20, error="the arm fell off")),
+        ("level", [replace(row, instance=row.instance.replace("/0/", "/2/", 1), level=2) for row in rows_of("b", [True] * 20)]),
+        ("robot", [replace(row, instance=f"{row.instance}-UR5e", robot="UR5e") for row in rows_of("b", [True] * 20)]),
+    ):
+        with pytest.raises(DataError, match="no instance in common on which both have an outcome"):
+            osel.compare(right, log_of(tmp_path / name, rows))
+    copy = log_of(tmp_path / "copy", rows_of("a", [True] * 20))
+    found = osel.compare(right, copy)
+    assert found.decision == "not enough data" and found.result["pairs"][0]["flips"] == []
+    (tmp_path / "link").symlink_to(right)
+    with pytest.raises(UsageError, match="given twice"):
+        osel.compare(right, tmp_path / "link")
+
+
+def test_unequal_repeats_count_each_instance_once(tmp_path):
+    often = [row for repeat in range(7) for row in rows_of("a", [seed % 2 for seed in range(40)], repeat=repeat)]
+    broken = rows_of("b", [False] * 40, repeat=1, error="lost")
+    (entry,) = osel.compare(log_of(tmp_path / "log", often + rows_of("b", [True] * 40) + broken)).result["pairs"]
+    assert (entry["instances"], entry["pairs_of_repeats"], entry["errors"]["second"]) == (40, 40, 40)
+    assert entry["differences"]["success"]["difference"] == pytest.approx(0.5)
+    assert (entry["test"]["gained"], entry["test"]["lost"]) == (20, 0)
 
 
 def test_a_task_that_got_worse_is_named_though_the_whole_did_not(tmp_path):
@@ -271,6 +325,16 @@ def test_a_page_shows_the_comparison_and_a_damaged_one_is_refused(tmp_path, caps
         osel.compare(tmp_path / "log", open=True)
 
 
+def test_a_pipe_is_written_into_and_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    logs = two_logs(tmp_path, 10, 5, 5, 10)
+    with ThreadPoolExecutor(1) as pool:
+        told = pool.submit((tmp_path / "pipe").read_text)
+        osel.compare(*logs, markdown=tmp_path / "pipe")
+        assert "points of success" in told.result(30)
+    assert (tmp_path / "pipe").is_fifo()
+
+
 def test_a_plan_says_how_many_instances_it_takes(tmp_path, capsys):
     logs = two_logs(tmp_path, 40, 10, 10, 40)
     assert main(["compare", *map(str, logs), "--plan", "--detect", "0.1"]) == 0
@@ -346,6 +410,21 @@ def test_claims_are_wrong_as_rarely_as_promised():
         at_margin = decisions(pairs, 0.075, 0.125)  # 5 points lower, as the margin says
         assert at_margin["better"] + at_margin["no worse"] <= 0.025 + slack
     assert decisions(1000, 0.05, 0.15)["worse"] > 0.95 and decisions(1000, 0.1, 0.1)["no worse"] > 0.85
+
+
+def test_the_benchmark_of_claims_finds_them_true():
+    spec = importlib.util.spec_from_file_location("benchmark_of_compare", ROOT / "benchmarks" / "compare.py")
+    benchmark = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = benchmark
+    spec.loader.exec_module(benchmark)
+    for name, kind in benchmark.KINDS.items():
+        for size in (10, 50, 200):
+            found = benchmark.simulate(kind, size, 1, 120)
+            assert found["wrong"] <= (0.025 if "margin" in name else 0.05) + 0.035, (name, size, found)
+            assert found["coverage"] >= 0.90, (name, size, found)
+        assert benchmark.sequential(kind, 100, 100)["wrong"] <= 0.05, name
+    assert benchmark.simulate(benchmark.KINDS["worse"], 200, 1, 50)["worse"] > 0.9
+    assert benchmark.simulate(benchmark.noisy(benchmark.KINDS["equal"]), 20, 3, 20)["wrong"] <= 0.2
 
 
 def test_the_instances_that_would_tell_mostly_do():

@@ -281,6 +281,7 @@ def test_an_instruction_is_drawn_to_its_task_where_there_are_several() -> None:
     assert one._task("lift", towards_lift) == both._task("lift", towards_lift[:0]) == 0.0
 
 
+@pytest.mark.slow
 def test_training_writes_a_folder_that_loads_and_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from osel_sim.training.encoder import recipe
     from osel_sim.training.encoder import train as training

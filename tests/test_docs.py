@@ -7,10 +7,10 @@ import re
 import shlex
 import tomllib
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 
 import pytest
+from test_cli import commands_of
 
 from osel_sim.__main__ import COMMANDS
 from osel_sim.api.run import RunConfig
@@ -22,6 +22,7 @@ from osel_sim.formats.task_file import load_task_file
 from osel_sim.ingestion.columns_file import load_columns
 from osel_sim.policy.registry import kinds
 from osel_sim.selection.registry import selector_locations
+from osel_sim.suites.gym.tasks import read_task
 from osel_sim.suites.registry import select_tasks
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -92,6 +93,8 @@ def test_toml_blocks_are_valid_files(block: Block, tmp_path: Path) -> None:
     file.write_text(block.text)
     if "scene" in data:
         load_task_file(file)
+    elif "id" in data:
+        read_task(file)
     elif "kind" in data:
         assert load_policy_file(file).kind in kinds()
     elif "table" in data:
@@ -129,12 +132,6 @@ def calls() -> dict[str, tuple[str, str]]:
     return {place: call for place, call in found.items() if not call[0].isupper()}
 
 
-def commands_of(name: str) -> list[Command]:
-    """The command of that name; `train` is two."""
-    module = import_module(f"osel_sim.{name}")
-    return [module.main] if isinstance(module.main, Command) else [module.policy_command, module.encoder_command]
-
-
 def words_of(text: str) -> list[str]:
     """Arguments, without what is said beside them."""
     text = re.split(r"\\?\||&&|;| {3,}(?=[^-#\s])", text)[0]
@@ -166,7 +163,8 @@ def test_command_lines_have_flags_that_exist(
     words = words_of(rest)
     if not words:
         return
-    command = commands_of(name)[-1 if any(word.startswith("--encoder") for word in words) else 0]
+    other = words.pop(0) == "install" if name == "suites" else any(word.startswith("--encoder") for word in words)
+    command = commands_of(name)[-1 if other else 0]
     if "--config" in words:
         Path("settings.toml").write_text("")
         words[words.index("--config") + 1] = "settings.toml"

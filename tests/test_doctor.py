@@ -10,6 +10,7 @@ from safetensors.numpy import save_file
 from osel_sim.cli import machine_checks
 from osel_sim.cli.machine_checks import Check
 from osel_sim.core import content
+from osel_sim.doctor import main as doctor_main
 
 
 def checkpoint(folder: Path) -> Path:
@@ -71,7 +72,7 @@ def test_the_command_reports_every_area_and_its_exit_code_agrees(tmp_path: Path)
     done = subprocess.run([sys.executable, "-m", "osel_sim.doctor", "--json"], capture_output=True, text=True, cwd=tmp_path)
     report = json.loads(done.stdout)
     checks = [Check(**check) for check in report["checks"]]
-    assert {check.area for check in checks} == {"python", "packages", "display", "machine", "tasks", "policies", "encoder"}
+    assert {check.area for check in checks} == {"python", "packages", "display", "machine", "tasks", "suites", "policies", "encoder"}
     assert {check.state for check in checks} <= {"ok", "note", "missing"}
     assert all(check.fix for check in checks if check.state == "missing")
     assert report["ready"] == all(check.state != "missing" for check in checks)
@@ -86,12 +87,11 @@ def test_without_opengl_it_names_the_packages(monkeypatch: pytest.MonkeyPatch) -
     assert "known: egl, osmesa, glfw" in found.found + found.fix
 
 
-def test_the_table_says_what_to_do(tmp_path: Path) -> None:
+def test_the_table_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "mine.toml").write_text("version = 1\n")
-    command = [sys.executable, "-m", "osel_sim.doctor", "--policies-dir", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 1
-    assert "correct mine.toml" in done.stdout
-    *_, summary, following = done.stdout.splitlines()
+    assert doctor_main(["--policies-dir", str(tmp_path)]) == 1
+    told = capsys.readouterr().out
+    assert "correct mine.toml" in told
+    *_, summary, following = told.splitlines()
     assert "missing" in summary
     assert f"-m osel_sim.doctor --policies-dir {tmp_path} " in following

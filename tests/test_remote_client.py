@@ -78,7 +78,7 @@ def test_a_server_that_accepts_and_says_nothing():
 )
 def test_a_server_of_something_else(reply):
     with tcp_server(reply) as url, raises_soon("is no WebSocket server|answered HTTP|no connection"):
-        RemoteClient(url, ENVIRONMENT, timeout=1).connect()
+        RemoteClient(url, ENVIRONMENT, timeout=0.4).connect()
 
 
 @pytest.mark.parametrize(

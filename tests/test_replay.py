@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 from synthetic_log import clusters, make_row, write_log
 
-from osel_sim.analysis.engine import Part, Setup
+from osel_sim.analysis.engine import Part, Setup, replay_parts
 from osel_sim.analysis.engine import replay as replay_all
 from osel_sim.analysis.gains import Gain
 from osel_sim.analysis.log import read_log
@@ -285,7 +285,7 @@ def test_workers_do_not_matter(log):
     outcomes = read_log(log)
     setups = [Setup(RewardWeights(0.0, 0.0)), Setup(RewardWeights(0.1, 0.0), {"linucb": {"optimism": 5.0}})]
     parts = [Part(outcomes, setups, names, range(2), 90), Part(outcomes, setups[1:], ["thompson"], range(1), 20)]
-    (one, last), (two, again) = (list(replay_all(parts, workers)) for workers in (1, 2))
+    (one, last), (two, again) = (list(replay_parts(parts, workers)) for workers in (1, 2))
     assert (last[0].chosen["thompson"] == again[0].chosen["thompson"]).all()
     for number in range(2):
         assert (one[number].order == two[number].order).all()
@@ -295,17 +295,17 @@ def test_workers_do_not_matter(log):
 
 def test_a_selector_sees_the_outcomes_of_its_choices_only(log, monkeypatch):
     outcomes = read_log(log)
-    [[first]] = replay_all([Part(outcomes, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)])
+    (first,) = replay_all(outcomes, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)
     chosen = np.zeros_like(outcomes.success, bool)
     rows = first.order[0]
     chosen[rows, first.chosen["linucb"][0], 0] = True
     other = read_log(log)
     other.success[~chosen] = 1.0 - other.success[~chosen]
-    [[again]] = replay_all([Part(other, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)])
+    (again,) = replay_all(other, [Setup(RewardWeights(0.0, 0.0))], ["linucb"], range(1), 100)
     assert (again.chosen["linucb"] == first.chosen["linucb"]).all()
 
 
-def test_a_verdict_comes_first_and_all_is_written_as_it_comes(tmp_path: Path, log, capsys):
+def test_a_verdict_comes_first_and_all_is_written_as_it_comes(tmp_path: Path, log, capsys, monkeypatch):
     """Interrupted while it replays what comes last, a replay leaves all that was told before; in the end nothing tells that it came in stages."""
     settings = {"seeds": 2, "decisions": 60, "workers": 1, "alpha_time": 0, "alpha_price": 0.1}
     told = []
@@ -318,12 +318,12 @@ def test_a_verdict_comes_first_and_all_is_written_as_it_comes(tmp_path: Path, lo
             raise KeyboardInterrupt
 
     out, names = tmp_path / "out", ["thompson", "linucb", "random"]
+    monkeypatch.setenv("BROWSER", "true")  # a program that does nothing
     with pytest.raises(KeyboardInterrupt):
-        replay(log, selectors=names, on_result=tell, out=out, **settings)
+        replay(log, selectors=names, on_result=tell, open=True, out=out, **settings)
     assert told == [(["thompson", "random", "frontier"], {"linucb"}, False), (["frontier"], set(names), False)]
     assert read_replay(out)[0]["pending"] == ["frontier"]
-    assert report_main([str(out), "--out", str(tmp_path / "page")]) == 0
-    assert "still being replayed: frontier" in (tmp_path / "page" / "report.html").read_text()
+    assert "so far; still being replayed: thompson, random, frontier" in (out / "report.html").read_text()
     flags = [word for name, value in settings.items() for word in (f"--{name.replace('_', '-')}", value)]
     capsys.readouterr()
     assert run(log, "--selectors", *names, "--out", out, "--overwrite", *flags) == 0

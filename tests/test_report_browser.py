@@ -103,6 +103,22 @@ def blank(driver) -> list[str]:
         return [...document.querySelectorAll(".plot")].filter((plot) => !drawn(plot)).map((plot) => plot.closest("figure").id);""")
 
 
+@pytest.mark.parametrize(("phone", "dark"), [(False, False), (True, True)])
+def test_a_comparison_is_drawn(driver, show, tmp_path, phone, dark):
+    import osel_sim as osel
+
+    made_log(tmp_path / "log")
+    page = osel.compare(tmp_path / "log", out=tmp_path / "compared").page
+    show(page, phone, dark)
+    assert driver.get_log("browser") == []
+    driver.execute_script("document.querySelectorAll('details').forEach((fold) => { fold.open = true; })")
+    wait(driver, "return document.querySelectorAll('.plot svg, .plot canvas').length >= 2", 20)
+    assert blank(driver) == []
+    assert driver.execute_script("return document.documentElement.scrollWidth <= window.innerWidth")
+    assert driver.execute_script("return window.pwned") is None
+    assert "points of success" in driver.find_element("id", "verdict").text
+
+
 @pytest.mark.parametrize("name", ["log", "replay", "run", "table"])
 @pytest.mark.parametrize(("phone", "dark"), [(False, False), (True, True)])
 def test_everything_is_drawn(driver, pages, show, name, phone, dark):

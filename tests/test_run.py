@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import time
@@ -15,7 +16,7 @@ from run_helpers import HORIZON, children, command, environment, execute, make_w
 from synthetic_log import make_row, write_log
 
 from osel_sim.analysis.live import read_live
-from osel_sim.formats.journal import read_journal
+from osel_sim.formats.journal import read_journal, to_line
 from osel_sim.reporting.run_page import run_page
 from osel_sim.run import main as run_main
 from osel_sim.selection.state import load_state
@@ -28,6 +29,7 @@ def world(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         folder = make_world(tmp_path_factory.mktemp("world"))
         patch.syspath_prepend(str(folder / "plugin"))
+        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])  # of servers that are started from here
         yield folder
 
 
@@ -63,6 +65,7 @@ def test_what_a_run_writes_and_prints(world, reference):
     assert remote, "the untrained selector explores"
     assert all(decision.seconds.upload > 0 and decision.price > 0 and decision.actions < HORIZON for decision in remote)
     assert len((folder / "timing.jsonl").read_text().splitlines()) == EPISODES
+    assert len({decision.scene for decision in decisions} - {None}) == EPISODES
 
 
 def test_summary_agrees_with_the_journal(reference):
@@ -98,9 +101,9 @@ def test_run_json_holds_what_the_run_depends_on(reference):
 def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference, trial):
     chance = random.Random(trial)
     folder = world / f"killed-{trial}"
-    arguments = ["--episodes", EPISODES, "--counterfactual", "--out", folder]
+    arguments = ["--episodes", EPISODES if trial else EPISODES - 1, "--counterfactual", "--out", folder]
     for attempt in range(1 + trial):
-        flags = [*(["--resume"] if attempt else []), *(["--video", "2", "--view"] if attempt == 0 else [])]
+        flags = ["--resume"] if attempt else ["--video", "2", *(["--view"] if trial else [])]
         process = subprocess.Popen(
             command(world, "run", *arguments, *flags), env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         )
@@ -110,13 +113,34 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
         process.send_signal(signal.SIGKILL)
         process.wait()
         process.stderr.close()
-        assert wait_until(lambda started=started: not any(map(alive, started)), 20)  # what shows the run among them
+        assert wait_until(lambda started=started: not any(map(alive, started)), 60)  # what shows the run among them
     assert run_page(folder).title.endswith(f" over {len(read_journal(folder / 'episodes.jsonl'))} decisions")
     assert len(read_journal(folder / "episodes.jsonl")) < EPISODES
-    done = execute(world, "run", *arguments, "--resume", "--no-page")
-    assert done.returncode == 0, done.stderr
+    if trial:
+        assert user(world, *arguments, "--resume", "--no-page") == 0
+    else:  # the settings are those that it began with, and there may be more decisions
+        assert run_main(["--out", str(folder), "--resume", "--episodes", str(EPISODES), "--no-page"]) == 0
+    assert json.loads((folder / "run.json").read_text())["configuration"]["episodes"] == EPISODES
     assert not (folder / "report.html").exists()
     assert bytes_of(folder) == bytes_of(reference[0])
+
+
+@pytest.mark.slow
+def test_a_journal_begun_without_scenes_goes_on_without(world, reference):
+    folder = world / "older"
+    shutil.copytree(reference[0], folder)
+
+    def without(lines: list[str]) -> bytes:
+        return "".join(to_line({key: value for key, value in json.loads(line).items() if key != "scene"}) for line in lines).encode()
+
+    lines = (folder / "episodes.jsonl").read_text().splitlines()
+    for name in ("timing.jsonl", "counterfactual.jsonl"):
+        (folder / name).write_text("".join((folder / name).read_text().splitlines(keepends=True)[:3]))
+    (folder / "episodes.jsonl").write_bytes(without(lines[:3]))
+    (folder / "summary.json").unlink()
+    done = execute(world, "run", "--episodes", EPISODES, "--counterfactual", "--out", folder, "--resume", "--no-page")
+    assert done.returncode == 0, done.stderr
+    assert (folder / "episodes.jsonl").read_bytes() == without(lines)
 
 
 def test_noise_on_actions_reaches_the_robot(tmp_path):
@@ -129,7 +153,7 @@ def test_noise_on_actions_reaches_the_robot(tmp_path):
     assert lengths[0] != lengths[1]
 
 
-def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world):
+def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world, capsys):
     rates = {"calm": 0.9, "wild": 0.1}
     chance = np.random.default_rng(0)
     keys = [f"short/test/0/{seed}" for seed in range(40)]
@@ -137,16 +161,15 @@ def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world):
     log = write_log(world / "log", rows, {key: chance.normal(size=53).astype(np.float32) for key in keys}, encoder="colours")
     out = world / "warm"
     flags = ["--selector", "auto", "--episodes", 4, "--no-page", "--out", out]
-    done = execute(world, "run", *flags, "--warm-start", log)
-    assert done.returncode == 0, done.stderr
-    assert f"shown beforehand: 72 outcomes of 36 instances of {log}, none of them of this run" in done.stderr
+    assert user(world, *flags, "--warm-start", log) == 0
+    assert f"shown beforehand: 72 outcomes of 36 instances of {log}, none of them of this run" in capsys.readouterr().err
     decisions = read_journal(out / "episodes.jsonl")
     assert decisions[0].propensities["calm"] > 0.99 and [decision.policy for decision in decisions] == ["calm"] * 4
     assert user(world, *flags, "--resume") == 2  # without the log it would be another run
     before = load_state(out / "selector.safetensors")
     costs = before["settings"]["expected_costs"]  # as the policy files declare them
     assert costs["wild"] > costs["calm"] and before["settings"]["skills"] is None  # they declare none
-    assert execute(world, "run", *flags, "--warm-start", log, "--resume").returncode == 0
+    assert user(world, *flags, "--warm-start", log, "--resume") == 0
     np.testing.assert_equal(load_state(out / "selector.safetensors"), before)
 
 
@@ -163,7 +186,7 @@ def test_ctrl_c_ends_with_what_there_is(world):
     assert summary["decisions"] == len(read_journal(folder / "episodes.jsonl")) >= 2
     assert "random" in output
     (name, config), *_ = next_commands(output)  # goes on with it
-    assert name == "run" and config.resume and config.folder == folder and config.episodes == 500
+    assert name == "run" and config.resume and config.out == folder and not config.task  # which run.json says
 
 
 def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):
@@ -173,6 +196,7 @@ def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):
         (["--alpha-price", "1"], "reward.alpha_price"),
         (["--selector", "random"], "selector"),
         (["--robot", "UR5e"], "robot"),
+        (["--episodes", "5"], "episodes"),
     ):
         assert user(world, "--episodes", EPISODES, "--counterfactual", "--out", folder, "--resume", *flags) == 2
         assert f"{key} was" in one_line(capsys)
@@ -181,21 +205,22 @@ def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):
 @pytest.mark.slow
 def test_another_robot_is_told_by_everything_a_run_writes(world, capsys):
     folder = world / "ur5e"
-    assert execute(world, "run", "--episodes", 2, "--counterfactual", "--robot", "UR5e", "--out", folder).returncode == 0
+    assert user(world, "--episodes", 2, "--counterfactual", "--robot", "UR5e", "--out", folder) == 0
+    capsys.readouterr()
     assert json.loads((folder / "run.json").read_text())["configuration"]["robot"] == "UR5e"
     assert [decision.robot for decision in read_journal(folder / "episodes.jsonl")] == ["UR5e", "UR5e"]
     assert read_live(folder).outcomes.keys == ("short/test/0/0-UR5e", "short/test/0/1-UR5e")  # they have contexts
     assert user(world, "--episodes", 2, "--counterfactual", "--out", folder, "--resume") == 2
     assert "robot was 'UR5e' at the beginning, now it is None" in one_line(capsys)
     before = bytes_of(folder)
-    assert execute(world, "run", "--episodes", 2, "--counterfactual", "--robot", "UR5e", "--out", folder, "--resume").returncode == 0
+    assert user(world, "--episodes", 2, "--counterfactual", "--robot", "UR5e", "--out", folder, "--resume") == 0
     assert bytes_of(folder) == before
 
 
-def test_a_dead_server_is_replaced_by_the_local_policy_and_the_journal_says_so(world):
+def test_a_dead_server_is_replaced_by_the_local_policy_and_the_journal_says_so(world, monkeypatch):
     """The server dies at its second call, in every episode anew."""
-    done = execute(world, "run", "--episodes", 3, "--selector", "fixed:wild", "--out", world / "crash", WANDER_DIES_ON="server")
-    assert done.returncode == 0, done.stderr
+    monkeypatch.setenv("WANDER_DIES_ON", "server")
+    assert user(world, "--episodes", 3, "--selector", "fixed:wild", "--no-page", "--out", world / "crash") == 0
     decisions = read_journal(world / "crash" / "episodes.jsonl")
     assert all(decision.fallback and not decision.error for decision in decisions)
     assert all(decision.seconds.upload > 2.0 and decision.calls == 2 for decision in decisions)  # it waited until the deadline
@@ -248,7 +273,7 @@ def test_used_out_without_resume_is_refused(world, reference, capsys):
 
 
 def user(world: Path, *flags: object) -> int:
-    """The command in this process, where it ends before anything heavy is done."""
+    """The command in this process, which has imported already what it needs; its servers are processes as ever."""
     os.environ["OMP_NUM_THREADS"] = "1"
     return run_main(list(map(str, command(world, "run", *flags)[3:])))
 
@@ -265,8 +290,7 @@ def test_tensorboard_files_have_each_decision_once_after_a_resume(world):
     accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="tensorboard is not installed")
     folder = world / "board"
     for resume in ([], ["--resume"]):
-        done = execute(world, "run", "--episodes", 3, "--selector", "random", "--tensorboard", "--out", folder, *resume)
-        assert done.returncode == 0, done.stderr
+        assert user(world, "--episodes", 3, "--selector", "random", "--tensorboard", "--no-page", "--out", folder, *resume) == 0
     events = accumulator.EventAccumulator(str(folder / "tensorboard"))
     events.Reload()
     decisions = read_journal(folder / "episodes.jsonl")

@@ -8,6 +8,7 @@ import pytest
 import torch
 from stable_baselines3 import PPO
 
+from osel_sim.analysis.engine import replay_one
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.interface.selector import Choice
 from osel_sim.selection.environment import SelectionEnv, table_rounds
@@ -37,6 +38,16 @@ def play(selector, contexts, rewards):
         chosen.append(selector.policies.index(choice.policy))
         selector.update(context, choice, row[chosen[-1]])
     return np.array(chosen)
+
+
+def decided(seed, contexts, rewards):
+    """Decision by decision, as a live run does it."""
+    return play(PPOSelector(POLICIES, 32, seed), contexts, rewards)
+
+
+def replayed(seed, contexts, rewards):
+    """All at once, as a replay does it: the same choices (`test_offline_ppo.py`), many times faster."""
+    return replay_one("ppo", contexts, rewards, POLICIES, seed)
 
 
 def weights(selector) -> list[torch.Tensor]:
@@ -140,7 +151,7 @@ def test_propensities_sum_to_one_and_match_frequencies():
     contexts, rewards, _ = problem(3, 30)
     selector = PPOSelector(POLICIES, 32, seed=0, learning_rate=1e-2, target_kl=None, **SMALL)
     play(selector, contexts, rewards)
-    choices = [selector.select(contexts[0]) for _ in range(4000)]
+    choices = [selector.select(contexts[0]) for _ in range(1500)]
     propensities = choices[0].propensities
     assert sum(propensities.values()) == pytest.approx(1.0, abs=1e-12)
     assert max(propensities.values()) > 0.4, "training should have moved them away from a third each"
@@ -150,10 +161,12 @@ def test_propensities_sum_to_one_and_match_frequencies():
     assert chosen.details["log_probability"] == pytest.approx(np.log(propensities[chosen.policy]), abs=1e-5)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
-def test_beats_the_best_fixed_policy_where_context_helps(seed):
+@pytest.mark.parametrize(
+    ("seed", "how"), [(0, replayed), pytest.param(1, decided, marks=pytest.mark.slow), pytest.param(2, decided, marks=pytest.mark.slow)]
+)
+def test_beats_the_best_fixed_policy_where_context_helps(seed, how):
     contexts, rewards, rates = problem(seed, 900)
-    chosen = play(PPOSelector(POLICIES, 32, seed), contexts, rewards)
+    chosen = how(seed, contexts, rewards)
     expected = rates[np.arange(len(rates)), chosen]
     best_fixed = rates.mean(axis=0).max()
     assert expected[-225:].mean() > best_fixed + 0.07

@@ -31,6 +31,34 @@ def test_mcnemar_midp_as_published(gained, lost, probability):
     assert mcnemar_midp(16, 6) == pytest.approx(0.035, abs=6e-4)  # the same, responses to chemotherapy
 
 
+@pytest.mark.parametrize(
+    ("gained", "lost", "exact"),  # p of the exact test without mid-p, by statsmodels 0.15's mcnemar
+    [(7, 1, 0.0703125), (16, 6, 0.052478790283203125), (5, 0, 0.0625), (30, 18, 0.11140289106101878), (3, 12, 0.03515625)],
+)
+def test_mcnemar_midp_is_the_exact_test_less_half_of_what_was_seen(gained, lost, exact):
+    from scipy.stats import binom, binomtest
+
+    assert binomtest(gained, gained + lost).pvalue == pytest.approx(exact)
+    assert mcnemar_midp(gained, lost) == pytest.approx(exact - binom.pmf(min(gained, lost), gained + lost, 0.5))
+
+
+@pytest.mark.parametrize(("gained", "lost", "pairs"), [(1, 7, 21), (9, 3, 40), (20, 20, 300), (0, 4, 50), (0, 0, 30)])
+def test_the_ends_of_the_score_interval_are_where_the_score_test_says(gained, lost, pairs):
+    """Tango's test again, with the likelihood under a difference maximised by SciPy instead of in closed form."""
+    from scipy.optimize import minimize_scalar
+    from scipy.special import xlogy
+
+    for end in score_interval(gained, lost, pairs):
+
+        def unlikely(share: float, end: float = end) -> float:  # `share`: probability of a loss
+            rest = max(1.0 - 2.0 * share - end, 0.0)
+            return -float(xlogy(gained, max(share + end, 0.0)) + xlogy(lost, share) + xlogy(pairs - gained - lost, rest))
+
+        found = minimize_scalar(unlikely, bounds=(max(0.0, -end), (1.0 - end) / 2.0), method="bounded", options={"xatol": 1e-12})
+        variance = (2.0 * found.x + end - end * end) / pairs
+        assert abs((gained - lost) / pairs - end) / np.sqrt(variance) == pytest.approx(1.959964, abs=2e-3)
+
+
 def test_score_interval_as_published():
     # Fagerland, Lydersen and Laake (2014), Bentur's airways: 1 and 7 of 21 pairs, Tango's interval.
     assert score_interval(1, 7, 21) == pytest.approx((-0.517, -0.026), abs=6e-4)
@@ -123,6 +151,7 @@ def test_mean_interval_is_students():
 def test_holm_by_hand():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([]) == []
+    assert holm([0.01, 0.04, 0.03, 0.005, 0.2]) == pytest.approx([0.04, 0.09, 0.09, 0.025, 0.2])  # statsmodels 0.15's multipletests
 
 
 def test_letters_are_shared_by_those_not_told_apart():

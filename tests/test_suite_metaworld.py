@@ -1,15 +1,18 @@
 """Meta-World: real tasks in the suite's own Python environment. Skipped where that has not been made."""
 
+import json
 import os
 import signal
 
 import numpy as np
 import pytest
 
+import osel_sim
 from osel_sim.core.errors import MissingPackageError, SuiteHostError, UsageError
 from osel_sim.episodes.loop import Driver, Subscriber, run_episode
 from osel_sim.episodes.start import Start
 from osel_sim.formats import library
+from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.interface.call import Call
 from osel_sim.policy.expert import ExpertCaller
 from osel_sim.suites import environments
@@ -210,3 +213,67 @@ def test_every_task_is_repeatable_and_most_experts_solve_theirs(name):
         outcomes.append(run_episode(env, task.instance(seed), expert()))
     env.close()
     assert all(outcome.error is None for outcome in outcomes) and any(outcome.success for outcome in outcomes)
+
+
+@pytest.fixture(scope="module")
+def experts(tmp_path_factory):
+    """Policy files: the scripted expert, and one that thinks for half a second before every action."""
+    folder = tmp_path_factory.mktemp("experts")
+    for name, seconds in (("quick", 0.0), ("pensive", 0.5)):
+        (folder / f"{name}.toml").write_text(
+            f'version = 1\nname = "{name}"\ntitle = "The scripted expert"\nlocation = "local"\nkind = "scripted_expert"\n'
+            f"execute = 1\ninference_seconds = {seconds}\n"
+        )
+    return folder
+
+
+@pytest.mark.slow
+@made
+def test_a_live_run_and_its_page(experts, tmp_path):
+    result = osel_sim.run(
+        task=("metaworld:drawer-open-v3", "metaworld:window-open-v3"),
+        policies=["quick", "pensive"],
+        policies_dir=experts,
+        selector="random",
+        episodes=2,
+        counterfactual=True,
+        level=(0, 2),
+        out=tmp_path / "run",
+    )
+    assert all(decision.outcome.error is None and decision.task.startswith("metaworld:") for decision in result.journal)
+    versions = json.loads((tmp_path / "run" / "run.json").read_text())["environment"]["versions"]
+    assert versions["metaworld/metaworld"] == "3.0.0" and versions["metaworld/mujoco"] == versions["mujoco"]
+    assert result.page is not None and result.page.is_file()
+
+
+@pytest.mark.slow
+@made
+def test_a_log_its_replay_and_their_pages(experts, tmp_path):
+    log = tmp_path / "log"
+    osel_sim.record(
+        task=("metaworld:drawer-open-v3",), policies=("quick", "pensive"), policies_dir=experts, instances=8, action_noise=0.3, workers=1, out=log
+    )
+    rows, _ = read_rollouts(log)
+    assert len(rows) == 16 and all(row.error is None for row in rows)
+    success = {name: np.mean([row.success for row in rows if row.policy == name]) for name in ("quick", "pensive")}
+    assert success["quick"] > success["pensive"], "half a second before every action is 40 steps of 500"
+    osel_sim.replay(log, selectors=["linucb", "random"], seeds=2, no_frontier=True, workers=1, out=tmp_path / "replay")
+    for folder in (log, tmp_path / "replay"):
+        assert osel_sim.report(folder, scenes=1).page.is_file()
+
+
+@pytest.mark.slow
+@made
+def test_demonstrations_of_the_expert(tmp_path):
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    out = tmp_path / "data"
+    (collected,) = osel_sim.collect(task=("metaworld:drawer-open-v3",), episodes=2, image_size=32, workers=1, out=out).collected
+    assert "2 demonstrations" in collected
+    dataset = LeRobotDataset("osel_sim/metaworld_drawer-open-v3", root=out)
+    first = dataset[0]
+    assert dataset.fps == 80 and first["task"] in load_tasks()["drawer-open-v3"].train
+    assert first["action"].shape == (4,) and first["observation.state"].shape == (4,)
+    assert first["observation.images.corner2"].shape == first["observation.images.gripperPOV"].shape == (3, 32, 32)
+    with pytest.raises(UsageError, match="is there already: give --resume"):
+        osel_sim.collect(task=("metaworld:drawer-open-v3",), episodes=2, out=out)

@@ -16,11 +16,13 @@ from test_record import files, resume
 import osel_sim as osel
 from osel_sim.analysis.log import read_outcomes
 from osel_sim.analysis.until_decided import UntilDecided, seeds_a_look
+from osel_sim.api.record import RecordConfig, _check_stopping
 from osel_sim.core.errors import DataError, SettingError, UsageError
 from osel_sim.episodes.workers import Plan, make_row
 from osel_sim.formats import library
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.interface.outcome import Outcome, Seconds
+from osel_sim.record import main as record_main
 from osel_sim.suites.registry import find_task
 
 OLD, NEW = "local_small", "remote_large"
@@ -72,7 +74,7 @@ def test_it_stops_where_compare_has_an_answer_and_not_before(plan, tmp_path, rat
     found = osel.compare(kept_log(tmp_path / "log", plan, rows, stop.kept), margin=margin)
     assert found.decision == decision and found.result["pairs"][0]["looks"] == len(stop.kept) // 12
     assert "at any time" in found.result["pairs"][0]["test"]["method"]
-    before = frozenset(key for key in stop.order[: len(stop.kept) - 12])
+    before = frozenset(stop.order[: len(stop.kept) - 12])
     earlier = osel.compare(kept_log(tmp_path / "before", plan, rows, before), margin=margin) if before else None
     assert earlier is None or (earlier.decision == "not enough data" and "more instances would tell" in earlier.verdict)
 
@@ -85,7 +87,7 @@ def test_it_goes_on_where_no_answer_is_there(plan, tmp_path):
 
 
 def test_rounds_have_all_tasks_and_levels_alike():
-    assert [seeds_a_look(*sizes) for sizes in ((1, 1), (1, 2), (3, 2), (11, 2), (1, 4), (10, 1))] == [10, 10, 4, 2, 12, 1]
+    assert [seeds_a_look(*sizes) for sizes in ((1, 1), (1, 2), (3, 2), (11, 2), (1, 4), (10, 1))] == [10, 10, 4, 4, 12, 4]
 
 
 def test_a_baseline_is_compared_with_by_instance_and_scene(plan, tmp_path):
@@ -131,6 +133,8 @@ def test_wrong_settings_are_named(tmp_path):
     ):
         with pytest.raises(SettingError, match=message):
             osel.record(task="lift", policies="local_small", out=tmp_path / "out", **values)
+    assert RecordConfig.of(task="lift", out=tmp_path).to_json().keys() >= {"margin", "until_decided", "baseline"}
+    _check_stopping(RecordConfig.of(**RecordConfig.of(task="lift", out=tmp_path).to_json()))  # of a run.json
     both = [row for policy in ("a", "b") for row in _rows(policy, 3)]
     with pytest.raises(SettingError, match="has several policies, a, b"):
         osel.record(
@@ -150,9 +154,10 @@ def _rows(policy: str, count: int) -> list:
 
 
 @pytest.mark.slow
-def test_killed_and_resumed_by_another_number_of_workers_it_stops_at_the_same_bytes(tmp_path, monkeypatch):
+def test_killed_and_resumed_by_another_number_of_workers_it_stops_at_the_same_bytes(tmp_path, monkeypatch, capsys):
     world = make_world(tmp_path / "world")
     monkeypatch.syspath_prepend(str(world / "plugin"))
+    monkeypatch.setenv("PYTHONPATH", environment(world)["PYTHONPATH"])  # of servers that are started from here
     flags = ["--instances", 40, "--start-seed", 40, "--until-decided", "--margin", 0.3]
     done = execute(world, "record", *flags, "--workers", 3, "--out", world / "whole")
     assert done.returncode == 0, done.stderr
@@ -169,19 +174,20 @@ def test_killed_and_resumed_by_another_number_of_workers_it_stops_at_the_same_by
     process.send_signal(signal.SIGKILL)
     process.wait()
     process.stderr.close()
-    done = resume(world, killed, "--workers", 2)
-    assert done.returncode == 0, done.stderr
+    assert resume(world, killed, "--workers", 2) == 0
     assert files(killed) == files(world / "whole")
-    again = resume(world, killed)
-    assert again.returncode == 0 and "stopped after 20 of 40" in again.stdout and files(killed) == files(world / "whole")
-    assert "repeats was 1 at the beginning" in resume(world, killed, "--repeats", 2).stderr
-    assert "margin: 0.2, but" in resume(world, killed, "--margin", 0.2).stderr
+    capsys.readouterr()
+    assert resume(world, killed) == 0
+    assert "stopped after 20 of 40" in capsys.readouterr().out and files(killed) == files(world / "whole")
+    for flag, value, says in (("--repeats", 2, "repeats was 1 at the beginning"), ("--margin", 0.2, "margin: 0.2, but")):
+        assert resume(world, killed, flag, value) == 2
+        assert says in capsys.readouterr().err
 
     places = ["--tasks", world / "tasks", "--policies-dir", world / "policies", "--margin", 0.3, "--workers", 2]
-    alone = [*command(world, "record")[:3], "--policies", "wild", "--baseline", world / "whole", "--baseline-policy", "calm", "--until-decided"]
-    done = subprocess.run(list(map(str, [*alone, *places, "--out", world / "new"])), env=environment(world), capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert "all 20 instances were needed" in done.stdout and "wild is no worse than calm" in done.stdout
+    alone = ["--policies", "wild", "--baseline", world / "whole", "--baseline-policy", "calm", "--until-decided", *places]
+    assert record_main(list(map(str, [*alone, "--out", world / "new"]))) == 0
+    told = capsys.readouterr().out
+    assert "all 20 instances were needed" in told and "wild is no worse than calm" in told
     told = json.loads((world / "new" / "run.json").read_text())["configuration"]
     assert (told["instances"], told["start_seed"], told["until_decided"]["baseline_policy"]) == (20, 40, "calm")
     assert osel.compare(world / "whole", world / "new", policies=["calm", "wild"], margin=0.3).decision == "no worse"
@@ -191,5 +197,5 @@ def test_killed_and_resumed_by_another_number_of_workers_it_stops_at_the_same_by
     changed = [dataclasses.replace(row, scene="0123456789abcdef") for row in rows]
     write_rollouts(other, changed, {key: value for key, value in metadata.items() if key != "schema_version"})
     alone[alone.index(world / "whole")] = other
-    done = subprocess.run(list(map(str, [*alone, *places, "--out", world / "newer"])), env=environment(world), capture_output=True, text=True)
-    assert done.returncode == 2 and "is not the same scene as in the baseline" in done.stderr
+    assert record_main(list(map(str, [*alone, "--out", world / "newer"]))) == 2
+    assert "is not the same scene as in the baseline" in capsys.readouterr().err

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from osel_sim.analysis.engine import Part, Setup, replay
+from osel_sim.analysis.engine import Setup, replay
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.oracles import oracles
 from osel_sim.analysis.result import build, with_fixed
@@ -34,7 +34,7 @@ def answer(log: LoggedOutcomes, weights: RewardWeights, budget: int = BUDGET) ->
         return None
     seeds, decisions = range(min(SEEDS, max(2, budget // len(log)))), min(len(log), max(1, budget // 2))
     setup = Setup(weights, told(log, log, weights, [RECOMMENDED]))
-    [[choices]] = replay([Part(log, [setup], [RECOMMENDED], seeds, decisions)])
+    [choices] = replay(log, [setup], [RECOMMENDED], seeds, decisions)
     best = oracles(log, weights)
     found: dict[str, Any] = build(log, weights, None, with_fixed(choices, best), best, left_out, seeds)["verdict"]
     return found | {"orders": len(seeds)}

@@ -1,5 +1,6 @@
 """Replays of selectors over streams of a log, in processes; the result does not depend on how many."""
 
+import os
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.streams import Streams, draw_streams
@@ -17,13 +19,12 @@ from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
 from osel_sim.interface.selector import SelectorFactory
-from osel_sim.selection.ppo.compiled import prepare
 from osel_sim.selection.reward import RewardWeights
 
 WARM = ":warm"
 """Ending of the name of a selector that is shown all outcomes of other instances before its stream begins."""
 
-SLOW_FIRST = ("ppo", "auto:warm", "auto", "neural_linear", "ppo_tuned", "vw_regcb", "vw_squarecb")
+SLOW_FIRST = ("ppo", "neural_linear", "auto:warm", "auto", "ppo_tuned", "vw_regcb", "vw_squarecb")
 """Selectors whose replays take longest are begun first, so that no worker is left with a long one at the end."""
 
 
@@ -82,12 +83,20 @@ _Job = tuple[int, int, str, int]
 
 
 def replay(
+    log: LoggedOutcomes, setups: Sequence[Setup], selectors: Sequence[str], seeds: Sequence[int], decisions: int | None = None, workers: int = 1
+) -> list[Choices]:
+    """Replay one part, whose attributes these are: the choices under each of its setups. See `replay_parts`."""
+    [choices] = replay_parts([Part(log, setups, selectors, seeds, decisions)], workers)
+    return choices
+
+
+def replay_parts(
     parts: Sequence[Part],
     workers: int = 1,
     progress: Callable[[int], Any] | None = None,
     factories: Mapping[str, SelectorFactory] | None = None,
-) -> Iterator[list[Choices]]:
-    """Replay parts in turn, with one set of workers: while the end of one is waited for, the next is begun.
+) -> Generator[list[Choices]]:
+    """Replay parts in turn, with one set of workers: while the end of one is waited for, the next is begun. Close the iterator to end them.
 
     Args:
         workers: processes; with 1 it happens in this one.
@@ -105,8 +114,6 @@ def replay(
         if warm and any(setup.warm_start is None for setup in part.setups):
             raise UsageError(f"{', '.join(warm)}: there are no outcomes of other instances to start warm with")
     materials = [_material(part) for part in parts]
-    if any({"ppo", "ppo_tuned"} & set(part.selectors) for part in parts):
-        prepare()  # here, once, rather than in every worker
     return _collected(parts, materials, workers, progress or (lambda decisions: None), factories or {})
 
 
@@ -118,7 +125,7 @@ def _material(part: Part) -> _Material:
 
 def _collected(
     parts: Sequence[Part], materials: Sequence[_Material], workers: int, count: Callable[[int], Any], factories: Mapping[str, SelectorFactory]
-) -> Iterator[list[Choices]]:
+) -> Generator[list[Choices]]:
     """Put what comes of the jobs together, part by part."""
     jobs: list[_Job] = [
         (number, at, name, seed)
@@ -207,8 +214,9 @@ def _run(
 
 
 def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
-    """What a worker does."""
-    _limit_threads()
+    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
+    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
+    threadpool_limits(1)
     return lambda job, _: [_replay_job(materials, factories, job)]
 
 
@@ -224,22 +232,15 @@ def _replay_job(materials: Sequence[_Material], factories: Mapping[str, Selector
     return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, **setup.settings.get(name, {}))
 
 
-def _limit_threads() -> Any:
-    """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
-    import torch
-    from threadpoolctl import threadpool_limits
-
-    torch.set_num_threads(1)
-    return threadpool_limits(1)
-
-
 @contextmanager
 def _one_thread() -> Iterator[None]:
+    """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
     import torch
 
     threads = torch.get_num_threads()
     try:
-        with _limit_threads():
+        torch.set_num_threads(1)
+        with threadpool_limits(1):
             yield
     finally:
         torch.set_num_threads(threads)

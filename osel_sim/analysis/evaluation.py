@@ -1,6 +1,7 @@
-"""Off-policy estimates of a live run: each fixed policy, random choice, and the best choice by a linear model."""
+"""Off-policy estimates of a live run: each fixed policy, random choice, the best choice by a linear model, and targets of one's own."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -14,14 +15,18 @@ from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
 
 
-def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
+def evaluate(live: LiveLog, weights: RewardWeights, own: Mapping[str, Array] | None = None) -> dict[str, Any]:
     """What `off_policy.json` holds, and `replay.json` under `off_policy`.
+
+    Args:
+        own: targets of one's own by name, probabilities (T, P) each (`osel_sim.analysis.targets`).
 
     Returns:
         run (folder, selector, decisions, errors, mean_reward, ci95), reward, policies, targets: name -> what an
         `osel_sim.analysis.off_policy.OffPolicyEstimate` holds, with `few` (which estimates rest on too few decisions to be relied upon) and
         `measured`: where the run has every outcome, what the target would really have come to, else None.
-        The targets are `fixed:<policy>`, `random`, and `greedy`: the policy of the highest reward by a linear model of the decisions so far.
+        The targets are `fixed:<policy>`, `random`, `greedy` (the policy of the highest reward by a linear model of the decisions so far), and those
+        of one's own.
 
     Raises:
         DataError: every decision ended in error.
@@ -39,6 +44,7 @@ def evaluate(live: LiveLog, weights: RewardWeights) -> dict[str, Any]:
     model = forward_model(contexts, rewards, chosen, len(log.policies))
     targets = {f"fixed:{policy}": np.tile(np.eye(len(log.policies))[column], (len(rewards), 1)) for column, policy in enumerate(log.policies)}
     targets |= {"random": np.full_like(propensities, 1.0 / len(log.policies)), "greedy": greedy(model)}
+    targets |= {name: target[valid] for name, target in (own or {}).items()}
     outcomes = log.mean_rewards(weights)
     everywhere = np.isfinite(outcomes).all(axis=1).any()
     found = {}

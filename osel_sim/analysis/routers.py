@@ -61,6 +61,12 @@ def routers(log: LoggedOutcomes, means: Array) -> dict[str, Router]:
     return found | {name: _by_model(make, features, means) for name, make in _models().items()}
 
 
+def context_routers(contexts: NDArray[np.float32], means: Array) -> dict[str, Router]:
+    """Those that look at contexts (N, D) alone."""
+    features = _features(contexts, [])
+    return {name: _by_model(make, features, means) for name, make in _models().items()}
+
+
 def _by_groups(means: Array, labels: Sequence[Sequence[str]]) -> Router:
     groups = group_numbers(labels, len(means))
     return lambda by, on: best_of_group(means, groups, by, on, SHRINK)

@@ -1,7 +1,7 @@
 """When a recording may stop: after every few instances one looks whether the answer is there, with bounds that hold however often one looks.
 
-Instances are recorded seed by seed, all tasks of a seed and all levels in turn, and looked at after whole rounds of them. So what is bounded at a
-look is the mean over tasks and levels alike, whatever the order of the tasks.
+Instances are recorded in rounds of a few seeds of all tasks, with all levels alike often, and looked at after whole rounds. So what is bounded at a
+look is the mean over tasks and levels alike, whatever their order.
 """
 
 import math
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.log import LoggedOutcomes, mean_over_repeats
 from osel_sim.core.errors import DataError, UsageError
-from osel_sim.episodes.workers import Episode, Plan
+from osel_sim.episodes.workers import KEPT_OPEN, Episode, Plan
 from osel_sim.formats.rollout_log import Row
 from osel_sim.formats.toml_types import quoted
 from osel_sim.interface.outcome import credited
@@ -25,6 +25,8 @@ ERROR = 0.05
 """Probability of a wrong answer, all pairs of policies together: half of it on each side."""
 FEWEST = 10
 """With fewer pairs nothing is claimed, and so many instances at least lie between two looks."""
+SEEDS_AN_OPENING = 4
+"""Seeds of a task in a round, where it is opened anew in each."""
 UNTIL_DECIDED = "until_decided"
 """Key in a log's metadata of how it was stopped: `margin`, `seeds_a_look`, `policies`, and of a baseline `baseline_policy` and `baseline_sha256`."""
 
@@ -35,8 +37,12 @@ def answered(bounds: Interval, pairs: int, margin: float) -> bool:
 
 
 def seeds_a_look(tasks: int, levels: int) -> int:
-    """Seeds between two looks: the fewest that make `FEWEST` instances or more, all levels alike often."""
-    return levels * math.ceil(FEWEST / (tasks * levels))
+    """Seeds between two looks: the fewest that make `FEWEST` instances or more, all levels alike often.
+
+    Of many tasks, which a worker cannot all keep open, so many that opening each once a round does not cost more than its episodes.
+    """
+    seeds = max(FEWEST / tasks, SEEDS_AN_OPENING if tasks > KEPT_OPEN else 1)
+    return levels * math.ceil(seeds / levels)
 
 
 def looks_of(metadata: Mapping[str, Any], place: str) -> tuple[int, int] | None:
@@ -72,12 +78,12 @@ class UntilDecided:
 
     def __init__(self, plan: Plan, policies: Sequence[str], margin: float, baseline: tuple[LoggedOutcomes, str] | None = None) -> None:
         self._plan, self._policies, self._margin = plan, tuple(policies), margin
-        self.order = sorted(plan.instances, key=lambda key: plan.instances[key].seed)  # those of a seed in the order of tasks
         every = seeds_a_look(len(plan.tasks), len(set(plan.levels)))
         rounds: dict[int, list[str]] = {}
-        for key in self.order:
-            rounds.setdefault((plan.instances[key].seed - plan.seeds.start) // every, []).append(key)
+        for key, instance in plan.instances.items():  # task by task, within a round as well
+            rounds.setdefault((instance.seed - plan.seeds.start) // every, []).append(key)
         self._rounds = [rounds[number] for number in sorted(rounds)]
+        self.order = [key for keys in self._rounds for key in keys]
         self._baseline = None if baseline is None else _Baseline(*baseline, self.order)
         self.kept: frozenset[str] | None = None
         names = ([""] if baseline is not None else []) + list(policies)

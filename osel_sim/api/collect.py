@@ -3,10 +3,13 @@
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from osel_sim.api.settings import CONTENT, INSTANCES, MAIN, Count, Folder, Levels, Names, Settings, settings
+from osel_sim.api.settings import CONTENT, INSTANCES, MAIN, OTHER, Count, Folder, Levels, Names, Settings, settings
 from osel_sim.core.errors import SettingError, UsageError
+
+if TYPE_CHECKING:
+    from osel_sim.interface.suite import Task
 
 
 @settings
@@ -25,6 +28,8 @@ class CollectConfig(Settings):
     """processes (default: one a core)"""
     image_size: Annotated[Count, MAIN] = 96
     """pixels, square"""
+    camera: Annotated[Names, OTHER] = ()
+    """cameras to record, of tasks of other suites; may be repeated (default: the first two that the environment has)"""
     level: Annotated[Levels, INSTANCES] = (0,)
     """how hard scenes are perturbed, 0 to 3; several take turns"""
     axis: Annotated[Names, INSTANCES] = ()
@@ -61,12 +66,18 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
     from osel_sim.core.holding import held
     from osel_sim.formats.levels import parse_axes, resolve
     from osel_sim.formats.run_config import robots_said
-    from osel_sim.suites.registry import select_task_files
+    from osel_sim.interface.suite import OURS
+    from osel_sim.suites.registry import known_axes, select_task_files, select_tasks
     from osel_sim.training import collection
 
     config = CollectConfig.of(**values) if config is None else config.changed(**values)
     if config.episodes is None or config.out is None:
         raise SettingError("out" if config.out is None else "episodes", "is missing")
+    chosen = select_tasks(config.task, config.tasks, config.robot)
+    if any(task.suite.spec.name != OURS for task in chosen):
+        return _collect_suites(config, chosen, parse_axes(config.axis, known_axes(chosen)))
+    if config.camera:
+        raise SettingError("camera", "is for other suites; ours are recorded with agentview and wrist")
     tasks = select_task_files(config.task, config.tasks, config.robot)
     axes = parse_axes(config.axis)
     outs = [config.out] if len(tasks) == 1 else [config.out / task.name for task in tasks]
@@ -85,4 +96,31 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
             continue
         with held(collection.shards_folder(out)):
             done.append(collection.collect(task, out, config.episodes, config.level, axes, config.image_size, config.workers))
+    return CollectResult(tuple(outs), tuple(done))
+
+
+def _collect_suites(config: CollectConfig, tasks: "list[Task]", axes: dict[str, int]) -> CollectResult:
+    """The same of tasks of other suites."""
+    from osel_sim.core.holding import held
+    from osel_sim.training import collection
+    from osel_sim.training.suite_demonstrations import check_expert
+
+    if config.episodes is None or config.out is None:
+        raise SettingError("out" if config.out is None else "episodes", "is missing")
+    outs = [config.out] if len(tasks) == 1 else [config.out / task.name.replace(":", "-").replace("/", "-") for task in tasks]
+    cameras = [check_expert(task, config.camera) for task in tasks]
+    for task, out in zip(tasks, outs, strict=True):
+        if (out.exists() or collection.shards_folder(out).exists()) and not config.resume:
+            raise UsageError(f"{out} is there already: give --resume to go on with it, or another --out")
+        for level in config.level:
+            task.instance(0, level, "train", axes)  # refuses an unknown level or axis before anything is written
+    done = []
+    for task, out, seen in zip(tasks, outs, cameras, strict=True):
+        kind: dict[str, object] = {"task": task.name, "task_version": task.info.digest, "levels": list(config.level), "axes": axes}
+        collection.check_settings(collection.shards_folder(out), kind | {"image_size": config.image_size, "cameras": list(seen)})
+        if collection.seeds(out) == config.episodes:
+            done.append(f"{out} is complete")
+            continue
+        with held(collection.shards_folder(out)):
+            done.append(collection.collect_suite(task, out, config.episodes, config.level, axes, config.image_size, seen, config.workers))
     return CollectResult(tuple(outs), tuple(done))

@@ -4,7 +4,7 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -59,8 +59,8 @@ class IngestConfig(TrustSettings):
     results: Annotated[Names | None, MAIN] = None
     """POLICY=FILE for two or more: result files of lerobot-eval (eval_info.json) or vla-eval, whose episodes are paired by task and seed"""
     encoder: Annotated[str | None, MAIN] = None
-    """tfidf, sentence:MODEL, MODEL:TAG of open_clip, a folder, or with images also A+tfidf and A+sentence:MODEL (default: tfidf, and with images
-    osel_small+tfidf)"""
+    """tfidf, sentence:MODEL, MODEL:TAG of open_clip, a folder, or with images also A+tfidf and A+sentence:MODEL; auto for whichever of those at hand
+    predicts success best (default: tfidf, and with images osel_small+tfidf)"""
     preset: Annotated[Literal["mmlu", "waymo", "alfred", "oxe"] | None, MAIN] = None
     """weights of the summary's rewards (default: oxe)"""
     device: Annotated[str, OTHER] = "cpu"
@@ -184,17 +184,20 @@ def _refuse(config: IngestConfig, names: Sequence[str], with_what: str) -> None:
 
 
 def _table(config: IngestConfig, out: Path) -> IngestResult:
+    from osel_sim.analysis.encoder_choice import AUTO, with_best_encoder
+    from osel_sim.analysis.log import read_log
     from osel_sim.context.appended import column_parts
     from osel_sim.context.encoder import load_log_encoder
     from osel_sim.context.names import DEFAULT_ENCODER
-    from osel_sim.context.text_encoders import TFIDF
+    from osel_sim.context.text_encoders import TFIDF, text_encoders_at_hand
     from osel_sim.core.files import file_digest
     from osel_sim.core.images import load_image
     from osel_sim.formats.rollout_log import PROPENSITIES
     from osel_sim.ingestion.convert import convert
     from osel_sim.ingestion.doubts import alike, beyond_reason
     from osel_sim.ingestion.readers import read_tables
-    from osel_sim.ingestion.write import IngestedInstance, check_out, write_log
+    from osel_sim.ingestion.write import IngestedInstance, check_out, name_encoder, write_log
+    from osel_sim.selection.reward import RewardWeights
 
     start = time.perf_counter()
     if config.results is not None:
@@ -224,7 +227,8 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     notes.append(f"{len(records)} rows: {len(instances)} instances, {len(converted.policies)} policies, {len(converted.rows)} outcomes")
     if converted.dropped:
         notes.append(f"{converted.dropped} duplicate rows left out, {converted.differing or 'none'} of which differed from the row that was kept")
-    name = config.encoder or (f"{DEFAULT_ENCODER}+{TFIDF}" if columns.images else TFIDF)
+    before = f"{DEFAULT_ENCODER}+" if columns.images else ""
+    names = [before + text for text in text_encoders_at_hand()] if config.encoder == AUTO else [config.encoder or before + TFIDF]
     sources = dict(found.files) if found else {file.name: file for file in {record.file for record in records}}
     metadata: dict[str, Any] = {
         "task": columns.name,
@@ -236,13 +240,19 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     texts = [item.text for item in instances]
     values = {column: [source.context[at] for source in converted.sources] for at, column in enumerate(columns.context)}
     appended = column_parts(values) if values else None
-    identity = write_log(
-        out, inputs, converted.rows, instances, lambda: load_log_encoder(name, texts, bool(columns.images), config.device), metadata, appended
-    )
+    loads = [partial(load_log_encoder, name, texts, bool(columns.images), config.device) for name in names]
+    identities = [write_log(out, inputs, converted.rows, instances, load, metadata, appended) for load in loads]
+    identity = identities[0]
+    if config.encoder == AUTO:
+        _, choice = with_best_encoder(read_log(out, identity), RewardWeights(0.0, 0.0))
+        identity = choice.encoder
+        name_encoder(out, identity)
+        notes.append(str(choice))
     return _result(config, out, converted.rows, identity, start, tuple(notes))
 
 
 def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
+    from osel_sim.analysis.encoder_choice import AUTO
     from osel_sim.context.encoder import load_log_encoder
     from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF
@@ -253,6 +263,8 @@ def _action_mse(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.interface.specification import specification
 
     start = time.perf_counter()
+    if config.encoder == AUTO:
+        raise UsageError(f"--encoder {AUTO} is for tables: name the encoder of a dataset's frames")
     if not config.dataset:
         raise SettingError("dataset", "is missing: give the folder of a LeRobotDataset")
     specs = choose_policies(config.policies, specification(), config.policies_dir)

@@ -12,7 +12,7 @@ from annotated_types import Ge, Le
 
 from osel_sim.api.results import RecordResult
 from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Folder, Group, Index, InstanceSettings, Names, settings
-from osel_sim.api.until_decided import baseline_then, check_flags, concluded, instances_of, read_baseline, said, stopping
+from osel_sim.api.until_decided import baseline_then, concluded, instances_of, said, stopping
 from osel_sim.core.errors import DataError, SettingError
 from osel_sim.core.trust import trusting
 
@@ -73,6 +73,8 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
     Raises:
         OselError: whatever is wrong with the settings, the files they name, or what came of them; the message says what.
     """
+    from osel_sim.analysis.log import read_outcomes
+
     config = RecordConfig.of(**values) if config is None else config.changed(**values)
     given = config.given
     if config.resume and not config.task and config.out is not None:
@@ -80,12 +82,21 @@ def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult
     folder = config.out
     if folder is None:
         raise SettingError("out", "is missing: give the folder to write to")
-    check_flags(config)
-    baseline = read_baseline(config)
+    _check_stopping(config)
+    baseline = None if config.baseline is None else read_outcomes(config.baseline)
     if baseline is not None and not config.task:
         config = _of_the_same_instances(config, baseline)
     with trusting(config.trust):
         return _record(config, folder, baseline, "encoder" in given)
+
+
+def _check_stopping(config: RecordConfig) -> None:
+    """Refuse settings that only go with `--until-decided`; a run.json has all settings, as they are by default."""
+    for name in ("margin", "baseline", "baseline_policy"):
+        if getattr(config, name) != getattr(RecordConfig, name) and not config.until_decided:
+            raise SettingError(name, "is for a recording until it is decided; add --until-decided, or leave it out")
+    if config.baseline_policy is not None and config.baseline is None:
+        raise SettingError("baseline_policy", "is a policy of --baseline; give that log, too")
 
 
 def _record(config: RecordConfig, folder: Path, baseline: "LoggedOutcomes | None", encoder_given: bool) -> RecordResult:
@@ -100,7 +111,7 @@ def _record(config: RecordConfig, folder: Path, baseline: "LoggedOutcomes | None
     before = read_run(folder) if config.resume and (folder / RUN).exists() else None
     stop = None
     if config.until_decided:
-        configuration |= said(config, plan, baseline, before and before["configuration"])
+        configuration |= said(plan, config.margin, baseline, config.baseline_policy, before and before["configuration"])
         stop = stopping(plan, configuration, baseline, folder)
     known = configuration if before is None else _as_it_began(configuration, before["configuration"])
     check_run_folder(folder, known, config.resume)

@@ -2,20 +2,24 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from osel_sim.api.results import ReplayResult
 from osel_sim.api.reward import weights_of
-from osel_sim.api.settings import MAIN, OTHER, Count, Folder, LoggedRewardSettings, Names, NonNegative, settings
+from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, NonNegative, settings
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
+    from osel_sim.analysis.encoder_choice import EncoderChoice
     from osel_sim.analysis.engine import Setup
     from osel_sim.analysis.frontier import FrontierPlan
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.analysis.targets import Target
     from osel_sim.interface.selector import SelectorFactory
     from osel_sim.selection.reward import RewardWeights
 
@@ -60,7 +64,11 @@ class ReplayConfig(LoggedRewardSettings):
     route_with: Annotated[Names | None, OTHER] = None
     """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
     encoder: Annotated[str | None, OTHER] = None
-    """whose contexts, where the log has several (default: the one it was recorded with)"""
+    """whose contexts, where the log has several, or auto: those that predict rewards best, by the choosing half (default: the one it was recorded
+    with)"""
+    targets: Annotated[Files, OTHER] = ()
+    """of a live run or logged decisions: tables of how you would choose (columns policy, probability, and decision or instance); what each would have
+    earned is estimated too"""
     context: Annotated[Literal["task"] | None, OTHER] = None
     """append the task's name to the contexts; auto finds out whether it helps"""
 
@@ -74,6 +82,7 @@ def replay(
     log: "Path | str | ReplayConfig",
     *,
     selectors: "str | Sequence[str | SelectorFactory] | None" = None,
+    targets: "Mapping[str, Target] | Sequence[Path | str] | Path | str | None" = None,
     on_result: Callable[[ReplayResult], None] | None = None,
     **values: Any,
 ) -> ReplayResult:
@@ -82,6 +91,8 @@ def replay(
     Args:
         log: folder of a rollout log or of a live run; or all settings as one object, of which `values` change some.
         selectors: names, or classes or functions of one's own: called with the policies' names, the context's length and the seed.
+        targets: of a live run, or of logged decisions: tables, or functions by name, of ways of choosing of one's own, whose reward is estimated
+            too. A function is called with an instance and its context and returns policy -> probability.
         on_result: called whenever more is there and written: with the verdict from `auto` and `linucb`, with that from all selectors, and with the
             frontier. What is yet to come, `ReplayResult.pending` says.
         values: settings by name, as `ReplayConfig` has them.
@@ -97,8 +108,11 @@ def replay(
     if selectors is not None:
         factories = {factory_name(selector): selector for selector in selectors if not isinstance(selector, str)}
         values["selectors"] = [selector if isinstance(selector, str) else factory_name(selector) for selector in selectors]
+    functions = targets if isinstance(targets, Mapping) else {}
+    if targets is not None and not isinstance(targets, Mapping):
+        values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
-    return _Replay(config, factories, on_result).execute()
+    return _Replay(config, factories, functions, on_result).execute()
 
 
 @dataclass(frozen=True)
@@ -107,10 +121,12 @@ class _Replay:
 
     config: ReplayConfig
     factories: "Mapping[str, SelectorFactory]"
+    targets: "Mapping[str, Target]"
     on_result: Callable[[ReplayResult], None] | None
 
     def execute(self) -> ReplayResult:
         """Do it."""
+        from osel_sim.analysis.encoder_choice import AUTO, with_best_encoder
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
         from osel_sim.analysis.logged_choices import choices_of, has_choices
@@ -121,17 +137,22 @@ class _Replay:
         selectors = [*choose_selectors(named, halved=config.half is not None), *self.factories]
         check_replay_folder(folder, config.overwrite)
         if not is_live_run(config.log):
-            log = read_log(config.log, config.encoder)
+            log = read_log(config.log, None if config.encoder == AUTO else config.encoder)
             weights, preset = weights_of(config, log.metadata)
             if not has_choices(log):
-                return self._replay(selectors, log, weights, preset)
+                if config.targets or self.targets:
+                    raise UsageError(f"{log.source} has the outcomes of every policy: a target is estimated from a live run or from logged decisions")
+                log, choice = with_best_encoder(log, weights) if config.encoder == AUTO else (log, None)
+                return self._replay(selectors, log, weights, preset, choice)
             live = choices_of(log)
+        elif config.encoder == AUTO:
+            raise UsageError(f"--encoder {AUTO} is for rollout logs: {config.log} is a live run, whose selector saw one encoder's contexts")
         else:
             live = read_live(config.log, config.encoder)
             weights, preset = weights_of(config, recorded=live.reward)
         found = self._off_policy(live, weights)
         if live.has_all_outcomes(weights):
-            return self._replay(selectors, live.outcomes, weights, preset, found)
+            return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
         write_off_policy(folder, found)
         return self._tell(ReplayResult(folder, off_policy=found), config.log, True)
 
@@ -141,11 +162,11 @@ class _Replay:
         log: "LoggedOutcomes",
         weights: "RewardWeights",
         preset: str | None,
+        choice: "EncoderChoice | None" = None,
         off_policy: dict[str, Any] | None = None,
     ) -> ReplayResult:
         """Replay stage by stage: what a verdict needs, all other selectors, and again at other weights. Each is written and told."""
-        from osel_sim.analysis.engine import Part
-        from osel_sim.analysis.engine import replay as replay_parts
+        from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import build, tables, with_fixed
         from osel_sim.core.progress import progress
@@ -157,21 +178,29 @@ class _Replay:
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
         here = setup(weights)
-        best = oracles(log, weights)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
         parts = [*stages, *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
-        with progress(sum(part.total for part in parts), "decision", scale=True) as bar:
-            for part, made in zip(parts, replay_parts(parts, config.workers, bar.update, self.factories), strict=True):
+        with (
+            progress(sum(part.total for part in parts), "decision", scale=True) as bar,
+            closing(replay_parts(parts, config.workers, bar.update, self.factories)) as replayed,
+            ThreadPoolExecutor(1) as beside,
+        ):
+            bounds = beside.submit(oracles, log, weights)  # while workers begin
+            if config.workers == 1:
+                bounds.result()  # what is replayed in this process limits its threads, on which last bits depend
+            for part, made in zip(parts, replayed, strict=True):
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}
+                    best = bounds.result()
                     choices = with_fixed(replace(made[0], chosen=known), best)
                     result = build(log, weights, preset, choices, best, left_out, seeds, config.margin, config.half is not None, config.route_with)
                     result["log"] |= {"half": config.half, "context": config.context}
+                    result["log"]["encoder_choice"] = None if choice is None else {"text": str(choice), **asdict(choice)}
                     result["off_policy"] = off_policy
                     result |= _told(here)
                 pending = [name for name in selectors if name not in chosen]
@@ -247,10 +276,16 @@ class _Replay:
     def _off_policy(self, live: "LiveLog", weights: "RewardWeights") -> dict[str, Any]:
         """Estimates from a live run's propensities."""
         from osel_sim.analysis.evaluation import evaluate
+        from osel_sim.analysis.targets import check_names, probabilities_of
+        from osel_sim.ingestion.target_tables import read_target
 
         if self.config.policies or self.config.half:
             raise UsageError("--policies and --half are for rollout logs: decisions that were made are evaluated as they were made")
-        return evaluate(live, weights)
+        log = live.outcomes
+        check_names([*(file.stem for file in self.config.targets), *self.targets], log.policies)
+        own = {file.stem: read_target(file, log.keys, log.policies) for file in self.config.targets}
+        own |= {name: probabilities_of(name, target, live) for name, target in self.targets.items()}
+        return evaluate(live, weights, own)
 
 
 def _stages(selectors: Sequence[str]) -> list[list[str]]:

@@ -23,7 +23,7 @@ from osel_sim.api.settings import (
     RewardSettings,
     settings,
 )
-from osel_sim.core.errors import UnknownNameError
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     out: Annotated[Path | None, MAIN] = None
     """where to write (default: runs/TASK-SELECTOR-sSEED)"""
     resume: Annotated[bool, MAIN] = False
-    """go on with the run in --out"""
+    """go on with the run in --out; alone with the settings that it began with, and with --episodes to more decisions than it was to have"""
     counterfactual: Annotated[bool, MAIN] = False
     """run the other policies as well, from the same state, to compare (nothing is learnt from them)"""
     video: Annotated[Index, OUTPUT] = 0
@@ -134,6 +134,8 @@ def run(
         values["selector"] = selector if isinstance(selector, str) else factory_name(selector)
         factory = None if isinstance(selector, str) else selector
     config = RunConfig.of(**values) if config is None else config.changed(**values)
+    if config.resume and not config.task and config.out is not None:
+        config = _as_begun(config, config.out)
     with trusting(config.trust):
         return _Run(config, objects, factory, subscribers).execute()
 
@@ -184,6 +186,10 @@ class _Run:
 
         config, folder = self.config, self.config.folder
         configuration = self._configuration()
+        # Decisions do not depend on how many follow.
+        self.grown = config.resume and (began := _episodes_of(folder)) is not None and began < config.episodes
+        if self.grown:
+            configuration["episodes"] = began
         check_run_folder(folder, configuration, config.resume)
         check_servers(self.everyone, self.environment)
         with contextlib.ExitStack() as holding:
@@ -195,7 +201,7 @@ class _Run:
         from osel_sim.context.encoder import load_encoder
         from osel_sim.context.names import DEFAULT_ENCODER
         from osel_sim.formats.journal import JOURNAL
-        from osel_sim.formats.run_config import start_or_resume
+        from osel_sim.formats.run_config import note_growth, start_or_resume
         from osel_sim.suites.ran_with import ran_with
 
         config = self.config
@@ -224,6 +230,8 @@ class _Run:
             if seen is not None:
                 self._start_warm(live, seen)
             live.replay()
+            if self.grown:
+                note_growth(folder, config.episodes)
             with _Interrupt() as interrupt:
                 live.run(config.episodes, lambda: interrupt.asked)
             interrupted = interrupt.asked and len(live.decisions) < config.episodes
@@ -327,6 +335,11 @@ class _Run:
         from osel_sim.analysis.warm_start import WarmStart, show
 
         own = live.instance_keys(self.config.episodes)
+        if self.grown and (shown := (own - live.instance_keys(_episodes_of(live.folder) or 0)).intersection(log.keys)):
+            raise UsageError(
+                f"--episodes {self.config.episodes}: {len(shown)} of the instances to come, such as {min(shown)}, are in {log.source}, "
+                "whose outcomes the selector was shown before the first decision; begin a new run"
+            )
         log = log.take([row for row, key in enumerate(log.keys) if key not in own])
         count = show(live.selector, WarmStart(log.contexts, log.rewards(self.weights)), live.selector.policies, self.config.seed)
         logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
@@ -365,6 +378,29 @@ class _Interrupt:
         self.asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
         logger.info("\nfinishing this decision; Ctrl-C again leaves at once")
+
+
+def _as_begun(config: RunConfig, folder: Path) -> RunConfig:
+    """The settings that the run in a folder began with, and those that are given now.
+
+    Raises:
+        UsageError: there is no run to resume, or it does not say with which settings it began.
+    """
+    from osel_sim.formats.run_config import RUN, check_run_folder, read_run
+
+    check_run_folder(folder, {}, resume=True)
+    began = read_run(folder).get("settings")
+    if not isinstance(began, dict) or not began.get("task"):
+        raise UsageError(f"{folder / RUN} does not hold the settings that the run began with: give --task and the other flags again")
+    return RunConfig.of(**(began | {name: getattr(config, name) for name in config.given}))
+
+
+def _episodes_of(folder: Path) -> int | None:
+    """How many decisions the run in a folder is to have."""
+    from osel_sim.formats.run_config import RUN, read_run
+
+    episodes = read_run(folder)["configuration"].get("episodes") if (folder / RUN).is_file() else None
+    return episodes if type(episodes) is int else None
 
 
 def title(tasks: "Sequence[Task]") -> str:

@@ -38,8 +38,8 @@ OTHER = Group("More", 5)
 
 
 def _one_or_many(value: Any) -> Any:
-    """A single string stands for a list of one: `task="lift"`."""
-    return (value,) if isinstance(value, str) else value
+    """A single string or path stands for a list of one: `task="lift"`."""
+    return (value,) if isinstance(value, str | Path) else value
 
 
 def _existing_folder(path: Path) -> Path:
@@ -60,6 +60,8 @@ Folder = Annotated[Path, AfterValidator(_existing_folder)]
 """A folder that exists and can be read."""
 Names = Annotated[tuple[str, ...], BeforeValidator(_one_or_many)]
 """Names; one alone may stand without a list around it."""
+Files = Annotated[tuple[Path, ...], BeforeValidator(_one_or_many)]
+"""Files; one alone may stand without a list around it."""
 Levels = Annotated[tuple[Index, ...], MinLen(1), BeforeValidator(lambda value: (value,) if isinstance(value, int) else value)]
 """Perturbation levels; one alone may stand without a list around it."""
 Split = Literal["train", "validation", "test"]

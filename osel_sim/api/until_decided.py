@@ -13,35 +13,10 @@ from osel_sim.formats.values import NAME
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.analysis.until_decided import UntilDecided
-    from osel_sim.api.record import RecordConfig
     from osel_sim.api.results import RecordResult
     from osel_sim.episodes.workers import Plan
 
 logger = logging.getLogger(__name__)
-
-
-def check_flags(config: "RecordConfig") -> None:
-    """Refuse settings that only go with `--until-decided`.
-
-    Raises:
-        SettingError: naming one.
-    """
-    for name in ("margin", "baseline", "baseline_policy"):
-        if name in config.given and getattr(config, name) is not None and not config.until_decided:
-            raise SettingError(name, "is for a recording until it is decided; add --until-decided, or leave it out")
-    if config.baseline_policy is not None and config.baseline is None:
-        raise SettingError("baseline_policy", "is a policy of --baseline; give that log, too")
-
-
-def read_baseline(config: "RecordConfig") -> "LoggedOutcomes | None":
-    """The log that is compared with, if there is one.
-
-    Raises:
-        DataError: it is damaged.
-    """
-    from osel_sim.analysis.log import read_outcomes
-
-    return None if config.baseline is None else read_outcomes(config.baseline)
 
 
 def instances_of(log: "LoggedOutcomes") -> dict[str, int]:
@@ -57,10 +32,13 @@ def instances_of(log: "LoggedOutcomes") -> dict[str, int]:
     return {"instances": len(known), "start_seed": known[0]}
 
 
-def said(config: "RecordConfig", plan: "Plan", baseline: "LoggedOutcomes | None", began: Mapping[str, Any] | None) -> dict[str, Any]:
+def said(
+    plan: "Plan", margin: float, baseline: "LoggedOutcomes | None", baseline_policy: str | None, began: Mapping[str, Any] | None
+) -> dict[str, Any]:
     """What `run.json` and the log say of it.
 
     Args:
+        baseline_policy: as it was given.
         began: the configuration the recording began with; None of a new one.
 
     Raises:
@@ -75,13 +53,13 @@ def said(config: "RecordConfig", plan: "Plan", baseline: "LoggedOutcomes | None"
     if began is not None and began.get(UNTIL_DECIDED) is not None:
         then = began[UNTIL_DECIDED]
         if not isinstance(then, dict) or not isinstance(then.get("policies"), list) or not set(then["policies"]) <= set(policies):
-            raise DataError(f"{config.out}: {UNTIL_DECIDED} in run.json does not have the promised form, or names policies that are not recorded")
+            raise DataError(f"run.json: {UNTIL_DECIDED} does not have the promised form, or names policies that are not recorded")
         policies = then["policies"]  # policies that came later do not decide
     if len(policies) < 2 and baseline is None:
         raise SettingError("until_decided", f"{policies[0]} alone is compared with nothing: name another policy, or give --baseline LOG")
-    told = {"margin": config.margin, "seeds_a_look": seeds_a_look(len(plan.tasks), len(set(plan.levels))), "policies": policies}
+    told = {"margin": margin, "seeds_a_look": seeds_a_look(len(plan.tasks), len(set(plan.levels))), "policies": policies}
     if baseline is not None:
-        told["baseline_policy"] = _policy_of(baseline, config.baseline_policy, policies)
+        told["baseline_policy"] = _policy_of(baseline, baseline_policy, policies)
         told["baseline_sha256"] = file_digest(baseline.source / ROLLOUTS)
     return {UNTIL_DECIDED: told}
 

@@ -57,6 +57,8 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
         notes.append("the predictable oracle is a router trained on all outcomes of one half of the instances and scored on the other half")
     if result["log"]["left_out"]["instances"]:
         notes.append(f"{log['left_out']['instances']} instances without an outcome of every policy were left out.")
+    if choice := log.get("encoder_choice"):
+        notes.append(choice["text"])
     for note in notes:
         console.print(plain(note))
     console.print(plain(result["verdict"]["text"], "bold"), soft_wrap=True)

@@ -118,12 +118,17 @@ class OpenClipEncoder:
 
     def embed_text(self, text: str) -> NDArray[np.float32]:
         """Embedding (d/2,) of length one."""
+        embedding: NDArray[np.float32] = self.embed_texts([text])[0]
+        return embedding
+
+    def embed_texts(self, texts: Sequence[str]) -> NDArray[np.float32]:
+        """Embeddings (n, d/2) of length one, in one batch."""
         import torch
 
         with torch.inference_mode():
-            tokens = self.tokenizer([text]).to(self.device)
-            embedding: NDArray[np.float32] = self.model.encode_text(tokens, normalize=True)[0].float().cpu().numpy()
-        return embedding
+            tokens = self.tokenizer(list(texts)).to(self.device)
+            embeddings: NDArray[np.float32] = self.model.encode_text(tokens, normalize=True).float().cpu().numpy()
+        return embeddings
 
 
 def _create(model: str, name: str, device: str, vocabulary: str | None = None, **options: Any) -> tuple[Any, Any]:

@@ -84,11 +84,18 @@ class SentenceEncoder:
 
     def encode(self, images: Sequence[Image], instruction: str) -> Context:
         """Context (d,) float32 of length one; what does not fit into the model's window is cut off."""
+        context: Context = self.encode_texts([instruction])[0]
+        return context
+
+    def encode_texts(self, texts: Sequence[str]) -> NDArray[np.float32]:
+        """Contexts (n, d) of texts, in one batch."""
         import torch
 
         with torch.inference_mode():
-            embedding: Context = self._model.encode([instruction], normalize_embeddings=True, show_progress_bar=False, convert_to_numpy=True)[0]
-        return embedding.astype(np.float32)
+            embeddings: NDArray[np.float32] = self._model.encode(
+                list(texts), batch_size=len(texts), normalize_embeddings=True, show_progress_bar=False, convert_to_numpy=True
+            )
+        return embeddings.astype(np.float32)
 
 
 class TfidfEncoder:
@@ -149,6 +156,10 @@ class TextOnly:
         """Context (d,) float32 of length one."""
         return self._encoder.embed_text(instruction)
 
+    def encode_texts(self, texts: Sequence[str]) -> NDArray[np.float32]:
+        """Contexts (n, d) of texts, in one batch."""
+        return self._encoder.embed_texts(texts)
+
 
 class ImagesAndText:
     """The image half of an open_clip encoder, then the context of an encoder that reads text; each of length one."""
@@ -182,6 +193,12 @@ def load_text_encoder(name: str, device: str = "cpu", texts: Sequence[str] | Non
     if texts is None:
         raise UsageError(f"encoder {TFIDF!r} is fitted on the texts of a log, so only python -m osel_sim.ingest can use it")
     return TfidfEncoder(texts)
+
+
+def text_encoders_at_hand() -> list[str]:
+    """Names of the encoders of texts that work on this machine as it is, without a download; the default first."""
+    installed = importlib.util.find_spec("sentence_transformers") is not None
+    return [TFIDF, *(f"{SENTENCE}{model}" for model in _BUNDLED if installed and _folder(model) is not None)]
 
 
 def _split(name: str) -> tuple[str, str, str]:

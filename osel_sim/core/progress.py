@@ -43,7 +43,7 @@ class Bar:
     @contextmanager
     def aside(self) -> Iterator[None]:
         """Take the bar away while the block prints something."""
-        from tqdm.auto import tqdm
+        from tqdm.auto import tqdm  # type: ignore[import-untyped]
 
         with tqdm.external_write_mode():
             yield
@@ -68,7 +68,7 @@ def progress(
         scale: shorten large numbers (12.3k).
         quiet: show nothing.
     """
-    from tqdm.auto import tqdm  # type: ignore[import-untyped]
+    from tqdm.auto import tqdm
 
     desc = None if description is None else _line(description)
     bar = Bar(lambda: tqdm(total=total, initial=initial, unit=unit, unit_scale=scale, desc=desc, dynamic_ncols=True, disable=quiet))

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 WORKER_DIED = "the worker process died"
 """How the error of an episode begins that was lost with its worker, which says nothing of the policy."""
 
+KEPT_OPEN = 2
+"""Environments that a worker keeps at a time."""
+
 Episode = tuple[str, int]
 """Policy and repeat."""
 
@@ -144,7 +147,7 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
     encoder, drivers = load_encoder(plan.encoder), Drivers(plan.everyone, common_specification(plan.tasks))
     if "torch" in sys.modules:  # importing it takes longer than an episode, and not every encoder and policy needs it
         sys.modules["torch"].set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
-    envs = OpenTasks(plan.tasks, keep=2)  # work comes task by task
+    envs = OpenTasks(plan.tasks, keep=KEPT_OPEN)  # work comes task by task
 
     def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | Row]":
         instance = plan.instances[job.instance]

@@ -77,12 +77,16 @@ def read_compare(folder: Path) -> dict[str, Any]:
 
 
 def write_report(flag: str, file: Path, text: str) -> None:
-    """Write a text file and the folders above it.
+    """Write a text file and the folders above it. A pipe or a device, such as `/dev/stdout`, is written into, never replaced.
 
     Raises:
         UsageError: it cannot be written; names the flag.
     """
     try:
+        if file.exists() and not file.is_file():
+            with file.open("w", encoding="utf-8") as handle:
+                handle.write(text)
+            return
         file.parent.mkdir(parents=True, exist_ok=True)
         write_text(file, text)
     except OSError as error:

@@ -17,6 +17,9 @@ NETWORKS = ("none", "ethernet", "wifi", "lte", "satellite")  # the profiles them
 MODES = ("blocking", "async")
 PRIVILEGED = ("scripted_expert",)
 """Kinds that see the simulator's state: a ceiling to compare with, never chosen unless named, and never behind a server."""
+VLA_EVAL = "vla_eval"
+SERVERS = ("openpi", VLA_EVAL)
+"""Kinds that only exist as somebody's server, reached by `url` of the policy file: what protocol it speaks."""
 _CAMERAS_WANTED = "must name one or more different cameras, "
 
 Cents = Annotated[float, between(0.0, 1e6)]
@@ -94,7 +97,8 @@ class _Keys:
     title: str
     """One line for listings."""
     kind: str
-    """Which class drives it; built in: `lerobot` (checkpoint folder or hub name), `openpi` (any openpi-protocol server), `scripted_expert`."""
+    """Which class drives it; built in: `lerobot` (checkpoint folder or hub name), `openpi` (any openpi-protocol server), `vla_eval` (any model server
+    of vla-evaluation-harness), `scripted_expert`."""
     checkpoint: str = ""
     """Folder relative to the content root, absolute folder, or hub name; empty for kinds without one."""
     execute: Annotated[int, between(1, 1000)]
@@ -185,8 +189,8 @@ class PolicyFile(_Keys):
         location, kind = info.data.get("location"), info.data.get("kind")
         if location == "local" and remote is not None:
             raise ValueError('only a policy with location = "remote" has this table')
-        if kind == "openpi" and location is not None and (remote is None or remote.url is None):
-            refuse((("url",), "is missing: a policy of kind 'openpi' is a server of its own, give its address (ws://host:port)"))
+        if kind in SERVERS and location is not None and (remote is None or remote.url is None):
+            refuse((("url",), f"is missing: a policy of kind {kind!r} is a server of its own, give its address (ws://host:port)"))
         return Remote() if location == "remote" and remote is None else remote
 
     @field_validator("mapping")

@@ -44,7 +44,7 @@ def read_run(folder: Path) -> dict[str, Any]:
     for key in ("configuration", "environment"):
         if not isinstance(data.setdefault(key, {}), dict):
             raise DataError(f"{file}: {key} must be an object, got {quoted(data[key])}")
-    for key, name in (("configuration", "content"), ("environment", "versions")):
+    for key, name in (("configuration", "content"), ("environment", "versions"), ("environment", "suites")):
         if not TEXTS.fits(data[key].get(name) or {}):
             raise DataError(f"{file}: {key}.{name} must be {TEXTS.wanted}, got {quoted(data[key][name])}")
     return data
@@ -187,6 +187,17 @@ def start_or_resume(
         for key, value in _flat(ran_with).items()
         if _flat(was).get(key) != value
     ]
+
+
+def note_growth(folder: Path, episodes: int) -> None:
+    """Write down that a run is to have more decisions than it began with.
+
+    Raises:
+        DataError: its `run.json` cannot be read.
+    """
+    run = read_run(folder)
+    settings = {"settings": run["settings"] | {"episodes": episodes}} if isinstance(run.get("settings"), dict) else {}
+    write_json(folder / RUN, run | settings | {"configuration": run["configuration"] | {"episodes": episodes}})
 
 
 def _compare(file: Path, old: dict[str, Any], new: dict[str, Any]) -> None:

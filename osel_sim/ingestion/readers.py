@@ -70,6 +70,19 @@ def read_tables(columns: Columns) -> list[Record]:
     return records
 
 
+def read_named(file: Path, needed: Collection[str], optional: Collection[str] = ()) -> tuple[set[str], list[Record]]:
+    """Rows of one table by columns whose names are fixed, and which of them it has.
+
+    Raises:
+        DataError: as `read_tables`.
+    """
+    table = _read_all(Path(), [str(file)], {*needed, *optional})
+    for column in needed:
+        if column not in table.there:
+            raise DataError(f"{file}: there is no column {quoted(column)}: {_instead(table, column)}")
+    return set(table.there), table.records
+
+
 def first_columns(base: Path, patterns: Sequence[str]) -> list[str]:
     """The columns of a table's first file.
 

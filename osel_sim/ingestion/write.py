@@ -12,8 +12,10 @@ from osel_sim.context.appended import Appended
 from osel_sim.core.errors import UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_json
 from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
-from osel_sim.interface.encoder import Encoder, Image
+from osel_sim.interface.encoder import Encoder, Image, TextEncoder
 
+BATCH = 32
+"""Texts that are encoded at once."""
 INGEST = "ingest.json"
 AUTOSAVE = 500
 
@@ -88,17 +90,26 @@ def write_log(
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / INGEST, {"instances": inputs})
     cache = ContextCache(folder, autosave=AUTOSAVE)
-    missing = [item for item in instances if cache.get(encoder.identity, item.key) is None]
+    missing = {item.key for item in instances if cache.get(encoder.identity, item.key) is None}
     try:
         with progress(len(instances), "context", initial=len(instances) - len(missing), quiet=not missing) as bar:
-            for item in missing:
-                cache.encode(encoder, item.key, item.images, item.text)
-                bar.update()
+            for batch in _batches(instances, encoder):
+                if missing.isdisjoint(item.key for item in batch):
+                    continue
+                if isinstance(encoder, TextEncoder):
+                    texts = list(dict.fromkeys(item.text for item in batch))
+                    contexts = dict(zip(texts, encoder.encode_texts(texts), strict=True))
+                    for item in batch:
+                        cache.put(encoder.identity, item.key, contexts[item.text])
+                else:
+                    for item in batch:
+                        cache.encode(encoder, item.key, item.images, item.text)
+                bar.update(len(missing.intersection(item.key for item in batch)))
         identity = encoder.identity
         if appended is not None:
-            contexts = cache.table(identity, [item.key for item in instances])
+            table = cache.table(identity, [item.key for item in instances])
             identity += appended.name
-            for item, context in zip(instances, np.concatenate([contexts, appended.parts], axis=1), strict=True):
+            for item, context in zip(instances, np.concatenate([table, appended.parts], axis=1), strict=True):
                 if cache.get(identity, item.key) is None:
                     cache.put(identity, item.key, context)
     finally:
@@ -106,3 +117,25 @@ def write_log(
     if not there:
         write_rollouts(folder, rows, {**metadata, "encoder": identity})
     return identity
+
+
+def name_encoder(folder: Path, identity: str) -> None:
+    """Make an encoder the log's own, whose contexts are taken where none is named."""
+    rows, metadata = read_rollouts(folder)
+    if metadata["encoder"] != identity:
+        write_rollouts(folder, rows, {**metadata, "encoder": identity})
+
+
+def _batches(instances: Sequence[IngestedInstance], encoder: Encoder) -> list[list[IngestedInstance]]:
+    """What is encoded at once: the instances of some texts of about one length, else one instance after another.
+
+    The last bits of a context depend on its neighbours in the batch. So batches are the same wherever an encoding was interrupted, and instances of
+    one text are in one batch.
+    """
+    if not isinstance(encoder, TextEncoder):
+        return [[item] for item in instances]
+    of_text: dict[str, list[IngestedInstance]] = {}
+    for item in instances:
+        of_text.setdefault(item.text, []).append(item)
+    texts = sorted(of_text, key=lambda text: (len(text), text))
+    return [[item for text in texts[start : start + BATCH] for item in of_text[text]] for start in range(0, len(texts), BATCH)]

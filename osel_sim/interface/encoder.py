@@ -1,7 +1,7 @@
 """What an encoder is: it turns an instance into its context."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,4 +27,13 @@ class Encoder(Protocol):
 
     def encode(self, images: Sequence[Image], instruction: str) -> Context:
         """Context (d,) float32 of one instance, from one or more uint8 (H, W, 3) RGB images and its instruction."""
+        ...
+
+
+@runtime_checkable
+class TextEncoder(Encoder, Protocol):
+    """One that reads the instruction only, and many at once faster than one after another."""
+
+    def encode_texts(self, texts: Sequence[str]) -> NDArray[np.float32]:
+        """Contexts (n, d) of instructions, in one batch: the last bits of each may depend on the others."""
         ...

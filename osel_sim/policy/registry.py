@@ -11,7 +11,7 @@ from typing import Any
 
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.registry import Registry
-from osel_sim.formats.policy_file import PRIVILEGED, PolicySpec
+from osel_sim.formats.policy_file import PRIVILEGED, SERVERS, PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Policy
 from osel_sim.policy.environment_fit import check_environment
@@ -20,7 +20,6 @@ MakeSession = Callable[[], Policy]
 Loader = Callable[[PolicySpec, EnvironmentSpec], MakeSession]
 
 LOADERS = Registry[Loader]("policy kind", "osel_sim.policies", {"lerobot": "osel_sim.policy.lerobot_policy:load"})
-SERVERS = ("openpi",)  # kinds that only exist as somebody's server, reached by `url` of the policy file
 
 
 def kinds() -> list[str]:

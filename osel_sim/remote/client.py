@@ -24,9 +24,12 @@ from osel_sim.policy.mapping import actions_of, message_of
 from osel_sim.remote.codec import ProtocolError, pack, unpack
 from osel_sim.remote.dialects import actions_in, size_of, unpack_any
 from osel_sim.remote.protocol import IMAGES, RESET, Greeting, check_header
+from osel_sim.remote.silent_servers import what_waits
 
 MAX_ANSWER = 16 << 20  # bytes; a chunk of 1,000 actions has 56,000
 CLOSE_SECONDS = 1.0
+QUIET_SECONDS = 2.0
+"""Without a greeting for so long, a server is asked what it is."""
 
 
 class HungUpError(RemoteError):
@@ -123,8 +126,8 @@ class RemoteClient:
         if self._connection is not None:
             return
         end = time.monotonic() + self._timeout
-        self._connection = self._open()
-        metadata = self._decode(self._receive(end), "greeting", foreign=True)  # whose it is, only the greeting says
+        self._open_connection()
+        metadata = self._decode(self._first(end), "greeting", foreign=True)  # whose it is, only the greeting says
         try:
             self._greeting = Greeting.parse(metadata)
         except ProtocolError as error:
@@ -160,7 +163,7 @@ class RemoteClient:
         environment = self._environment
         if self._connection is None:
             raise UnsentError(f"{self.url}: not connected")
-        reply, bytes_up = self._ask(message_of(observation, self._mapping, _cameras(observation), environment) if self.foreign else observation)
+        reply, bytes_up = self._ask(self.message(observation) if self.foreign else observation)
         measured = time.perf_counter() - start
         try:
             if self.foreign:
@@ -176,11 +179,18 @@ class RemoteClient:
         payload = {key: value for key, value in reply.items() if not key.endswith("timing")} if isinstance(reply, dict) else reply
         return Answer(actions, measured, bytes_up, size_of(payload) if self.foreign else len(pack(payload)))
 
+    def message(self, observation: Observation) -> dict[str, Any]:
+        """What a server that is not ours is sent for an observation."""
+        return message_of(observation, self._mapping, cameras_in(observation), self._environment)
+
     def close(self) -> None:
         """Hang up. May be called twice; takes at most a second or so."""
         self._connection = None
         with contextlib.suppress(OSError, WebSocketException):
             self._hang_up.close()
+
+    def _open_connection(self) -> None:
+        self._connection = self._open()
 
     def _open(self) -> ClientConnection:
         headers = {"Authorization": f"Api-Key {self._token}"} if self._token else None
@@ -237,11 +247,15 @@ class RemoteClient:
         return f"wants a token: put it into the environment variable {TOKEN_VARIABLE}"
 
     def _ask(self, message: Any) -> tuple[Any, int]:
+        end = time.monotonic() + self._timeout
+        frame = pack(message)
+        self._send(frame)
+        return self._decode(self._receive(end), "answer", self.foreign), len(frame)
+
+    def _send(self, frame: bytes) -> None:
         if self._connection is None:
             raise UnsentError(f"{self.url}: not connected")
         self._check_silent(self._connection)
-        end = time.monotonic() + self._timeout
-        frame = pack(message)
         try:
             self._connection.send(frame)
         except ConnectionClosed as error:
@@ -249,7 +263,6 @@ class RemoteClient:
             if full:
                 raise self._fail(f"took no message within {self._timeout:g} s", NoAnswerError) from None
             raise self._fail(f"closed the connection ({error})", HungUpError) from None
-        return self._decode(self._receive(end), "answer", self.foreign), len(frame)
 
     def _check_silent(self, connection: ClientConnection) -> None:
         """Refuse an answer that lies ready before its question: a server that answers twice would shift all answers by one, unnoticed."""
@@ -261,7 +274,23 @@ class RemoteClient:
             raise self._fail(f"closed the connection ({error})", GoneError) from None
         if isinstance(early, str):
             raise self._fail(_reported(early), UnsentError)
-        raise self._fail("sent a message that nobody asked for: it must answer each message once", UnsentError)
+        raise self._fail(self._unasked(early), UnsentError)
+
+    def _unasked(self, frame: bytes) -> str:
+        """What is wrong with a message that lies there before a question."""
+        return "sent a message that nobody asked for: it must answer each message once"
+
+    def _first(self, end: float) -> str | bytes:
+        """The first message, which a server of openpi's protocol sends by itself. Of one that stays silent it is found out what it is."""
+        if self._connection is not None:
+            try:
+                return self._connection.recv(timeout=max(0.001, min(QUIET_SECONDS, end - time.monotonic())))
+            except TimeoutError:
+                if waits := what_waits(self._address):
+                    raise self._fail(waits) from None
+            except (ConnectionClosed, OSError):
+                pass  # the next receive says so
+        return self._receive(end)
 
     def _receive(self, end: float) -> str | bytes:
         if self._connection is None:
@@ -292,7 +321,8 @@ def _reported(text: str) -> str:
     return f"reported an error: {lines[-1][:300]}"
 
 
-def _cameras(observation: Observation) -> tuple[str, ...]:
+def cameras_in(observation: Observation) -> tuple[str, ...]:
+    """Cameras whose images an observation has."""
     return tuple(key.removeprefix(IMAGES) for key in observation if key.startswith(IMAGES))
 
 

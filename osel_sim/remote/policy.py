@@ -4,19 +4,20 @@ import contextlib
 import os
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from osel_sim.core.errors import RemoteError, UsageError
-from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.formats.policy_file import VLA_EVAL, PolicySpec
 from osel_sim.interface.call import Call
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Observation
 from osel_sim.interface.specification import specification
 from osel_sim.policy.environment_fit import check_environment
-from osel_sim.policy.mapping import message_of
 from osel_sim.remote.client import Answer, HungUpError, NoAnswerError, RemoteClient, UnsentError
 from osel_sim.remote.network import Delays, NetworkModel, NetworkProfile, profile
 from osel_sim.remote.policy_process import PolicyServerProcess
 from osel_sim.remote.protocol import STATE, TOKEN_VARIABLE, Greeting, example_observation, select_observation
+from osel_sim.remote.vla_eval import VlaEvalClient
 
 DEADLINE = "deadline"
 OUTAGE = "outage"
@@ -154,9 +155,8 @@ def open_remote(
         client = _connected(spec, environment, timeout)
         if client.foreign:
             client.close()
-            token = os.environ.get(TOKEN_VARIABLE)
             # A server that compiles its model with the first request takes long for it.
-            _try_mapping(spec, environment, RemoteClient(spec.remote.url, environment, token, start_timeout, mapping=spec.mapping))
+            _try_mapping(spec, environment, _client(spec, environment, start_timeout))
         return RemotePolicy(spec, client)
     with contextlib.ExitStack() as undo:
         server = PolicyServerProcess(spec, environment, timeout, start_timeout)
@@ -189,13 +189,19 @@ def _connected(spec: PolicySpec, environment: EnvironmentSpec, timeout: float) -
     Raises:
         RemoteError: naming the policy.
     """
-    url = spec.remote.url if spec.remote else None
-    client = RemoteClient(url or "", environment, os.environ.get(TOKEN_VARIABLE), timeout, Greeting.of(spec, environment), spec.mapping)
+    client = _client(spec, environment, timeout, Greeting.of(spec, environment))
     try:
         client.connect()
     except RemoteError as error:
         raise RemoteError(f"policy {spec.name!r} ({spec.file}): {error}") from None
     return client
+
+
+def _client(spec: PolicySpec, environment: EnvironmentSpec, timeout: float, expect: Greeting | None = None) -> RemoteClient:
+    """A client of the kind of server that a policy file names, not yet connected."""
+    kind = VlaEvalClient if spec.kind == VLA_EVAL else RemoteClient
+    url = spec.remote.url if spec.remote else None
+    return kind(url or "", environment, os.environ.get(TOKEN_VARIABLE), timeout, expect, spec.mapping)
 
 
 def _try_mapping(spec: PolicySpec, environment: EnvironmentSpec, client: RemoteClient) -> None:
@@ -207,11 +213,20 @@ def _try_mapping(spec: PolicySpec, environment: EnvironmentSpec, client: RemoteC
     except RemoteError as error:
         sent = ", ".join(
             f"{key} ({value.dtype} {value.shape})" if hasattr(value, "shape") else f"{key} (text)"
-            for key, value in message_of(example, spec.mapping, spec.cameras, environment).items()
+            for key, value in _flat(client.message(example)).items()
         )
         raise RemoteError(f"{spec.file}: the server does not take what the file's [mapping] gives it: {error}; it was sent {sent}") from None
     if length < spec.execute:
         raise RemoteError(f"{spec.file}: the server's chunks hold {length} actions, execute = {spec.execute}")
+
+
+def _flat(message: dict[str, Any]) -> dict[str, Any]:
+    """A message without maps in it: `images.agentview`."""
+    return {f"{key}.{inner}" if inner else key: item for key, value in message.items() for inner, item in _items(value)}
+
+
+def _items(value: Any) -> "list[tuple[str, Any]]":
+    return list(value.items()) if isinstance(value, dict) else [("", value)]
 
 
 def _cut(delays: Delays, deadline: float) -> tuple[float, float, float]:

@@ -37,9 +37,13 @@ def run_until_signal(server: "PolicyServer", ready: Callable[[int], None]) -> No
     last_resort.start()
 
 
-def stop_with_stdin() -> None:
-    """Stop this process when whoever holds the other end of standard input is gone."""
-    while os.read(0, 4096):
+def stop_with_stdin(descriptor: int = 0) -> None:
+    """Stop this process when whoever holds the other end of standard input is gone.
+
+    Args:
+        descriptor: of it, where it has been put elsewhere.
+    """
+    while os.read(descriptor, 4096):
         pass
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(10.0)

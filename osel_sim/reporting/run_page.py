@@ -242,6 +242,7 @@ def _facts(run: _Run) -> list[tuple[str, str]]:
     facts = [("folder", str(run.folder)), *((key, _words(value)) for key, value in own.items()), ("reward", formula(run.weights))]
     facts += [(name, str(digest)[:12]) for name, digest in dict(run.configuration.get("content") or {}).items()]
     versions = ", ".join(f"{name} {version}" for name, version in dict(ran_with.get("versions") or {}).items())
+    facts += [(f"suite {name}", f"it has {cannot}") for name, cannot in dict(ran_with.get("suites") or {}).items()]
     return [*facts, ("versions", versions), ("git", str(ran_with.get("git"))), ("OpenGL", str(ran_with.get("gl")))]
 
 

@@ -34,6 +34,9 @@ NOTHING = 1e-6
 GROWTH = 1.25
 """Features and evidence are computed afresh whenever there are this many times as many decisions."""
 
+PIECES = 16
+"""A change is looked for at the ends of so many equal pieces of what was seen."""
+
 WARM = 2000
 """Of more warm contexts than these, evenly spaced ones are taken."""
 
@@ -48,6 +51,7 @@ class Prior:
         optimism, chance: weights of two ways to explore what a policy's success in this context is, >= 0.
         mean_optimism, mean_chance: the same for what its success is in any context.
         floor: the probability with which the n-th choice is made at random is floor / sqrt(n), half at most; in [0, 1].
+        alarm: what was seen before a change is forgotten once rewards are so many times as probable with it as without; > 1, infinite for never.
         expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
             learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
         warm_contexts: (n, context_dim) contexts without outcomes, from which features are learned before the first decision; None starts cold.
@@ -65,6 +69,7 @@ class Prior:
     mean_optimism: float = 0.0
     mean_chance: float = 0.0
     floor: float = 0.0
+    alarm: float = math.inf
     expected_costs: Mapping[str, float] | None = None
     warm_contexts: ArrayLike | None = None
     skills: Skills | None = None
@@ -75,6 +80,8 @@ class Prior:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise UsageError(f"{name} must be finite and >= 0, got {value}")
+        if not self.alarm > 1.0:
+            raise UsageError(f"alarm must be greater than 1, got {self.alarm}")
         if not 0.0 <= self.floor <= 1.0:
             raise UsageError(f"floor must lie in [0, 1], got {self.floor}")
         if not self.signals or not all(math.isfinite(signal) and signal > 0.0 for signal in self.signals):
@@ -89,7 +96,9 @@ class Prior:
         """How it explores and what it considers, as JSON values."""
         lists = {"signals": [float(value) for value in self.signals], "shared": [float(value) for value in self.shared]}
         parts = {"parts": list(self.parts)} if self.parts else {}
-        return {**lists, **{name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}, **parts}
+        alarm = {"alarm": float(self.alarm)} if math.isfinite(self.alarm) else {}
+        weights = {name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}
+        return {**lists, **weights, **parts, **alarm}
 
 
 class BayesianSelector(SelectorBase):
@@ -109,7 +118,8 @@ class BayesianSelector(SelectorBase):
 
     Whenever the number of decisions has grown by a quarter, features are fitted afresh to the contexts seen so far, and the regression is computed
     again on them; in between it is updated decision by decision. Where a context has two parts, features of the first, of both and of the second are
-    fitted, and those of the highest evidence kept until the next time.
+    fitted, and those of the highest evidence kept until the next time. Then, too, it is asked whether some policy has become better or worse; if the
+    evidence says so, the decisions before are forgotten (see `alarm` in `Prior`).
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
@@ -205,10 +215,10 @@ class BayesianSelector(SelectorBase):
     def _catch_up(self) -> None:
         """Learn from what came since the last choice. Of several fits that are due only the last is computed, as nothing is left of those before: a
         warm start with thousands of outcomes is quick."""
-        count, due = len(self._targets), 0
-        while self._next_fit <= count:
-            due, self._next_fit = self._next_fit, max(self._next_fit + 1, math.ceil(self._next_fit * GROWTH))
-        if due:
+        while self._next_fit <= (count := len(self._targets)):
+            due = 0
+            while self._next_fit <= count:
+                due, self._next_fit = self._next_fit, max(self._next_fit + 1, math.ceil(self._next_fit * GROWTH))
             self._fit(due)
         for at in range(self._known, count):
             row = np.concatenate([self._heads[at], self._transform(self._contexts[at])[0]])
@@ -229,7 +239,37 @@ class BayesianSelector(SelectorBase):
             found.append(self._regress(contexts, chosen, targets))
         self._view = int(np.argmax([evidence for evidence, _, _ in found]))
         _, self._signal, self._regression = found[self._view]
+        if change := self._change(contexts, chosen, targets):
+            for seen in (self._contexts, self._heads, self._chosen, self._targets):
+                del seen[:change]
+            self._counts = np.bincount(self._chosen, minlength=len(self.policies))
+            self._next_fit = max(count - change + 1, math.ceil((count - change) * GROWTH))
+            self._fit(count - change)
+            return
         self._known, self._transformed = count, None
+
+    def _change(self, contexts: Array, chosen: NDArray[np.int64], targets: Array) -> int:
+        """How many of the decisions to forget: those before policies became better or worse than the contexts explain; 0 where nothing changed.
+
+        What the regression leaves unexplained has mean 0 for every policy, at all times, however choices changed while it was learned. Compared is
+        that with means of their own before and after a change (Gaussian, of prior variance 1 relative to the noise), wherever it was.
+        """
+        if not math.isfinite(self._prior.alarm) or len(chosen) < PIECES:
+            return 0
+        starts = len(chosen) * np.arange(1, PIECES) // PIECES
+        heads = np.array(self._heads[: len(targets)], np.float64)
+        rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
+        left = targets - heads @ self._guess - (rows * self._regression.weights[chosen]).sum(axis=1)
+        left /= math.sqrt(self._regression.noise)
+        piece = np.searchsorted(starts, np.arange(len(chosen)), side="right")
+        counts, sums = np.zeros((2, PIECES, len(self._counts)))
+        np.add.at(counts, (piece, chosen), 1.0)
+        np.add.at(sums, (piece, chosen), left)
+        counts, sums = counts.cumsum(axis=0), sums.cumsum(axis=0)
+        before, after = _evidence(counts[:-1], sums[:-1]), _evidence(counts[-1] - counts[:-1], sums[-1] - sums[:-1])
+        ahead = before + after - _evidence(counts[-1:], sums[-1:])
+        most = float(ahead.max())
+        return int(starts[ahead.argmax()]) if most + math.log(np.exp(ahead - most).mean()) > math.log(self._prior.alarm) else 0
 
     def _regress(self, contexts: Array, chosen: NDArray[np.int64], targets: Array) -> tuple[float, float, SharedRegression]:
         """Evidence for the features that there are now, how much they matter by it, and the regression on them."""
@@ -342,6 +382,11 @@ class BayesianSelector(SelectorBase):
         self._view = state.get("view", 0)
         self._features.load(_part(state, "features."))
         self._known, self._seen, self._transformed = len(self._targets), None, None
+
+
+def _evidence(counts: Array, sums: Array) -> Array:
+    """Log probability (n,) of numbers of variance 1 and means of prior variance 1, over that with means of 0, from counts and sums (n, P)."""
+    return np.asarray((0.5 * (sums**2 / (counts + 1.0) - np.log(counts + 1.0))).sum(axis=1), np.float64)
 
 
 def _part(state: State, prefix: str) -> State:

@@ -16,12 +16,13 @@ class KernelUCBSelector(BayesianSelector):
 
     Contexts that lie together share what was learned of a policy, those apart do not, so regions of any shape can be told apart, and the selector
     begins as a bandit without context and becomes a contextual one as far as the rewards speak for it (see `BayesianSelector`). Where they
-    never do it is Thompson sampling on the policies' means, and ends with the best single policy. Declared costs spare it learning time and price,
+    never do it is a bandit on the policies' means, and ends with the best single policy. Declared costs spare it learning time and price,
     declared skills trying everything everywhere; it works without, and with no context seen before.
 
-    What a policy does in one context is explored by optimism, which wastes least where there are many contexts; what it does on the whole by chance,
-    as optimism never returns to a policy whose first tries were bad luck. Settings were chosen on made-up problems (`benchmarks/selection.py`, seeds
-    below 1000) and the choosing half of `assets/logs/suite`.
+    What a policy does in one context is explored by optimism, which wastes least where there are many contexts; what it does on the whole by optimism
+    and chance together. Optimism alone never returns to a policy whose first tries were bad luck; chance alone tries worse policies longer. Where the
+    evidence says that a policy became better or worse, what was before is forgotten. Settings were chosen on made-up problems like those of
+    `benchmarks/selection.py`, drawn from other seeds, and on the choosing half of `assets/logs/suite`.
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
@@ -30,7 +31,7 @@ class KernelUCBSelector(BayesianSelector):
         warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
         parts: lengths of the encoder's part of a context and of what is appended to it; which of them are used, the evidence says. Empty: one whole.
         components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
-        signals, shared, optimism, chance, mean_chance, floor: see `Prior`.
+        signals, shared, optimism, mean_optimism, chance, mean_chance, floor, alarm: see `Prior`.
 
     Raises:
         UsageError: a number out of range, or contexts (those of the skills, too) of another form.
@@ -56,9 +57,11 @@ class KernelUCBSelector(BayesianSelector):
         signals: Sequence[float] = (0.05, 0.3, 1.2),
         shared: Sequence[float] = (0.0, 0.5),
         optimism: float = 1.0,
+        mean_optimism: float = 1.0,
         chance: float = 0.1,
-        mean_chance: float = 0.7,
+        mean_chance: float = 0.4,
         floor: float = 0.1,
+        alarm: float = 1e4,
     ) -> None:
         if components < 1 or landmarks < 1 or not width > 0.0:
             raise UsageError(f"components and landmarks must be at least 1 and width positive, got {components}, {landmarks}, {width}")
@@ -67,9 +70,11 @@ class KernelUCBSelector(BayesianSelector):
             signals,
             shared,
             optimism=optimism,
+            mean_optimism=mean_optimism,
             chance=chance,
             mean_chance=mean_chance,
             floor=floor,
+            alarm=alarm,
             expected_costs=expected_costs,
             warm_contexts=warm_contexts,
             skills=skills,

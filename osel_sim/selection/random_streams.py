@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import numpy as np
-import torch
 
 from osel_sim.interface.selector import State
 
@@ -17,6 +16,8 @@ class RandomStreams:
     """
 
     def __init__(self, seed: int) -> None:
+        import torch
+
         self.torch = torch.Generator().manual_seed(seed).get_state()
         self.numpy = np.random.RandomState(seed).get_state(legacy=False)
 
@@ -27,6 +28,8 @@ class RandomStreams:
         One thread is fast enough on batches this small, and makes the bits independent of how many cores there are: sums split over threads round
         differently.
         """
+        import torch
+
         others_torch, others_numpy, threads = torch.get_rng_state(), np.random.get_state(legacy=False), torch.get_num_threads()
         torch.set_rng_state(self.torch)
         np.random.set_state(self.numpy)
@@ -51,6 +54,8 @@ class RandomStreams:
 
     def load(self, state: State) -> None:
         """Take over what `state` gave."""
+        import torch
+
         has_gauss, gauss = state["random.numpy.gauss"]
         self.torch = torch.from_numpy(state["random.torch"].copy())
         self.numpy = {

@@ -82,6 +82,11 @@ class SharedRegression:
         variances = (gains * rows).sum(axis=1) + ((apart @ self.shared_covariance) * apart).sum(axis=1)
         return means, np.maximum(variances, 1e-12)
 
+    @property
+    def weights(self) -> Array:
+        """Means (P, K) of shared and own weights together."""
+        return np.asarray(self.means + self.covariances @ ((self.shared_covariance @ self.information) / self.prior), np.float64)
+
     def update(self, policy: int, row: Array, target: float) -> None:
         """Take one more observation into account (Sherman and Morrison); the noise and the evidence stay as they are."""
         gain = self.covariances[policy] @ row

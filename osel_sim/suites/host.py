@@ -139,7 +139,9 @@ def serve(suite: str, ready: int) -> None:
         ready: descriptor to which the address is written.
     """
     os.set_inheritable(ready, False)
-    threading.Thread(target=stop_with_stdin, daemon=True).start()
+    parent = os.dup(0)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)  # a simulator that asks its user something (LIBERO does) must fail, not wait
+    threading.Thread(target=stop_with_stdin, args=(parent,), daemon=True).start()
     authorization = f"Api-Key {os.environ.pop(TOKEN_VARIABLE)}".encode()
     table = Table(module_of(suite))
 

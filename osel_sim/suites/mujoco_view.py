@@ -7,6 +7,7 @@ touched: its physics are what they are without pictures, to the last bit.
 import atexit
 from collections import OrderedDict
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -39,13 +40,24 @@ class MujocoView:
         describe: gives a new `mujoco.MjSpec` of the model, the same as what the simulator compiled but for what is only looked at.
         upside_down: cameras whose pictures are turned by 180 degrees.
         groups: geom groups that are shown.
+        sites: whether sites are.
+        make_light: makes the meshes of a spec light; None: every heavy one without a flat texture.
     """
 
     def __init__(
-        self, model: Any, data: Any, describe: Callable[[], Any], upside_down: Collection[str] = (), groups: Collection[int] = (0, 1, 2)
+        self,
+        model: Any,
+        data: Any,
+        describe: Callable[[], Any],
+        upside_down: Collection[str] = (),
+        groups: Collection[int] = (0, 1, 2),
+        sites: bool = True,
+        make_light: Callable[[Any], None] | None = None,
     ) -> None:
         self._model, self._data, self._describe = model, data, describe
-        self._upside_down, self._groups = frozenset(upside_down), tuple(groups)
+        self._upside_down = frozenset(upside_down)
+        self._shown = _Shown(tuple(groups), sites)
+        self._make_light = make_light or (lambda spec: _lighten(spec, model))
         self._look: Callable[[Any], None] = lambda model: None
         self._copies: dict[str, _Copy] = {}
         self.cameras = tuple(model.camera(index).name for index in range(model.ncam))
@@ -69,10 +81,10 @@ class MujocoView:
                 f"quality must be one of {', '.join(QUALITIES)}, sizes within 1 to {LARGEST} pixels; got {quality!r}, {width} x {height}"
             )
         if quality not in self._copies:
-            self._copies[quality] = _Copy(self._describe(), quality, self._model)
+            self._copies[quality] = _Copy(self._describe(), quality, self._model, self._make_light)
         copy = self._copies[quality]
         copy.follow(self._model, self._data, self._look)
-        image = _renderer(copy, quality, self._groups).render(copy.data, self.cameras.index(camera), width, height)
+        image = _renderer(copy, quality, self._shown).render(copy.data, self.cameras.index(camera), width, height)
         return np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
 
     def close(self) -> None:
@@ -83,14 +95,22 @@ class MujocoView:
         self._copies.clear()
 
 
+@dataclass(frozen=True)
+class _Shown:
+    """What is drawn of a model."""
+
+    groups: tuple[int, ...]
+    sites: bool
+
+
 class _Copy:
     """A model to be looked at, with the poses of the simulator's."""
 
-    def __init__(self, spec: Any, quality: str, own: Any) -> None:
+    def __init__(self, spec: Any, quality: str, own: Any, make_light: Callable[[Any], None]) -> None:
         import mujoco
 
         if quality == "fast":
-            _lighten(spec, own)
+            make_light(spec)
         self.model = spec.compile()
         if (self.model.nbody, self.model.ngeom, self.model.nq) != (own.nbody, own.ngeom, own.nq):
             raise UsageError("the model to be looked at is another than the simulator's")
@@ -127,7 +147,7 @@ class _Copy:
 class _Renderer:
     """One GL context with one model."""
 
-    def __init__(self, model: Any, quality: str, groups: Collection[int]) -> None:
+    def __init__(self, model: Any, quality: str, shown: _Shown) -> None:
         import mujoco
 
         self._mujoco, self._model = mujoco, model
@@ -140,7 +160,9 @@ class _Renderer:
             self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
             self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._option = mujoco.MjvOption()
-        self._option.geomgroup[:] = [group in groups for group in range(len(self._option.geomgroup))]
+        self._option.geomgroup[:] = [group in shown.groups for group in range(len(self._option.geomgroup))]
+        if not shown.sites:
+            self._option.sitegroup[:] = 0
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
 
@@ -160,14 +182,14 @@ class _Renderer:
         self._gl.free()
 
 
-def _renderer(copy: _Copy, quality: str, groups: Collection[int]) -> _Renderer:
+def _renderer(copy: _Copy, quality: str, shown: _Shown) -> _Renderer:
     """The renderer of a model, made where it has none; the one unused for longest makes room."""
     if id(copy) not in _renderers:
         if not _renderers:
             forking.holds(_HOLDER)
         while len(_renderers) >= KEPT:
             _renderers.popitem(last=False)[1].close()
-        _renderers[id(copy)] = _Renderer(copy.model, quality, groups)
+        _renderers[id(copy)] = _Renderer(copy.model, quality, shown)
         if len(_renderers) == 1:
             # mujoco takes GL down at exit. Last registered runs first, so register after it.
             atexit.unregister(_HOLDER.close)

@@ -10,7 +10,7 @@ from osel_sim.suites.environments import environment as suite_environment
 
 
 def ran_with(tasks: Iterable[Task]) -> dict[str, Any]:
-    """Versions, those of the suites' packages included, and the OpenGL backend: `none` where no suite renders in this process.
+    """Versions, those of the suites' packages included, the OpenGL backend (`none` where no suite renders), and what the suites cannot do.
 
     Raises:
         DisplayError: a suite needs a backend, and none works.
@@ -25,4 +25,5 @@ def ran_with(tasks: Iterable[Task]) -> dict[str, Any]:
         for place in suite.environments:
             own = suite_environment(place).versions(suite.packages)
             found["versions"] |= {f"{place}/{package}": version for package, version in own.items()}
-    return found
+    cannot = {suite.name: "; ".join(suite.cannot) for suite in suites if suite.cannot}
+    return found | ({"suites": cannot} if cannot else {})

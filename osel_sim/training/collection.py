@@ -6,14 +6,15 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from osel_sim.core.errors import UsageError, WorkerError
+from osel_sim.core.errors import DataError, UsageError, WorkerError
 from osel_sim.core.files import atomic_folder, read_json, write_text
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.task_file import TaskSpec
+from osel_sim.interface.suite import Task
 from osel_sim.training.annotations import SIDE_FILE
-from osel_sim.training.demonstrations import Shard, record_shard, side_file
+from osel_sim.training.demonstrations import DONE, Shard, side_file
 
 logger = logging.getLogger(__name__)
 
@@ -44,39 +45,82 @@ def check_settings(folder: Path, settings: dict[str, object]) -> None:
 
 
 def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], axes: Mapping[str, int], image_size: int, workers: int) -> str:
-    """Record all missing shards with `workers` processes, then join them into one dataset at `out`. Returns what was done, in words."""
-    from osel_sim.core.progress import progress
+    """Record all missing shards of a task of ours with `workers` processes, then join them into one dataset at `out`. Says in words what was done."""
     from osel_sim.sim.gl import choose_backend
     from osel_sim.sim.osc import prepare
 
     choose_backend()
     prepare()
-    logger.info("%s: starting %d workers ...", task.name, workers)
-    _quiet_lerobot()
     shards = [
         Shard(task.file, shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes, task.robot)
-        for first in range(0, episodes, SHARD)
-        for count in (min(SHARD, episodes - first),)
+        for first, count in _parts(episodes)
     ]
-    frames = 0
+    return _collect(task.name, shards, out, workers, lambda failed: side_file(task, levels, axes, len(shards), episodes, failed))
+
+
+def collect_suite(
+    task: Task, out: Path, episodes: int, levels: tuple[int, ...], axes: Mapping[str, int], image_size: int, cameras: tuple[str, ...], workers: int
+) -> str:
+    """The same of a task of another suite, whose environment has a scripted expert."""
+    from osel_sim.training.suite_demonstrations import SuiteShard, suite_side_file
+
+    shards = [
+        SuiteShard(task, shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes, cameras)
+        for first, count in _parts(episodes)
+    ]
+    return _collect(task.name, shards, out, workers, lambda failed: suite_side_file(task, levels, axes, len(shards), episodes, failed))
+
+
+class Recordable(Protocol):
+    """A run of consecutive training seeds that is recorded and saved together."""
+
+    @property
+    def folder(self) -> Path:
+        """Where to."""
+        ...
+
+    @property
+    def episodes(self) -> int:
+        """How many seeds."""
+        ...
+
+    def record(self) -> tuple[int, int, list[int]]:
+        """Frames, episodes, and seeds that the expert failed on."""
+        ...
+
+
+def _parts(episodes: int) -> list[tuple[int, int]]:
+    """First seed and number of seeds of each shard."""
+    return [(first, min(SHARD, episodes - first)) for first in range(0, episodes, SHARD)]
+
+
+def _collect(name: str, shards: Sequence[Recordable], out: Path, workers: int, side: Callable[[list[int]], dict[str, Any]]) -> str:
+    from osel_sim.core.progress import progress
+
+    logger.info("%s: starting %d workers ...", name, workers)
+    _quiet_lerobot()
+    episodes, frames = sum(shard.episodes for shard in shards), 0
     failed: list[int] = []
-    with progress(episodes, "episode", task.name) as bar:
+    with progress(episodes, "episode", name) as bar:
         for shard, shard_frames, shard_failed in _record_shards(shards, workers, bar.begin):
             frames, failed = frames + shard_frames, failed + shard_failed
             bar.note(f"frames={frames}, failed={len(failed)}")
             bar.update(shard.episodes)
-    _join(task, out, [shard.folder for shard in shards], side_file(task, levels, axes, len(shards), episodes, sorted(failed)))
+    if len(failed) == episodes:
+        raise DataError(f"{name}: the expert failed on every seed; there is nothing to make a dataset of")
+    kept = [shard.folder for shard in shards if read_json(shard.folder / DONE)["episodes"]]
+    _join(name, out, kept, side(sorted(failed)))
     return f"{out}: {episodes - len(failed)} demonstrations, {frames} frames; the expert failed on {len(failed)} of {episodes} seeds"
 
 
-def _record_shards(shards: Sequence[Shard], workers: int, ready: Callable[[], None]) -> Iterator[tuple[Shard, int, list[int]]]:
+def _record_shards(shards: Sequence[Recordable], workers: int, ready: Callable[[], None]) -> Iterator[tuple[Recordable, int, list[int]]]:
     """Record shards in worker processes, unless they are there already: each with its number of frames and the seeds that the expert failed on.
 
     Raises:
         WorkerError: a worker died twice on a shard; after the others have been recorded.
         Exception: what a shard raised, such as OSError where the disk is full.
     """
-    lost: list[Lost[Shard]] = []
+    lost: list[Lost[Recordable]] = []
     with closing(run_jobs(_recorder, shards, workers, ready=ready)) as events:
         for event in events:
             if isinstance(event, Lost):
@@ -90,11 +134,11 @@ def _record_shards(shards: Sequence[Shard], workers: int, ready: Callable[[], No
         raise WorkerError(f"{len(lost)} shards were lost with their worker processes, the first of them {lost[0].job} ({lost[0].cause})")
 
 
-def _recorder() -> Work[Shard, tuple[int, int, list[int]]]:
+def _recorder() -> Work[Recordable, tuple[int, int, list[int]]]:
     """What a worker does. Workers share the cores: one thread each, for numpy, torch and Mesa's rasteriser. The progress bar is the parent's."""
     os.environ.update(OMP_NUM_THREADS="1", LP_NUM_THREADS="1", HF_DATASETS_DISABLE_PROGRESS_BARS="1")
     _quiet_lerobot()
-    return lambda shard, _: [record_shard(shard)]
+    return lambda shard, _: [shard.record()]
 
 
 def _quiet_lerobot() -> None:
@@ -102,11 +146,11 @@ def _quiet_lerobot() -> None:
     logging.getLogger("lerobot.utils.import_utils").setLevel(logging.ERROR)
 
 
-def _join(task: TaskSpec, out: Path, folders: list[Path], side: dict[str, Any]) -> None:
+def _join(task: str, out: Path, folders: list[Path], side: dict[str, Any]) -> None:
     """Make one dataset out of shards, with a side file, put in place only when it is whole."""
     from lerobot.datasets.aggregate import aggregate_datasets
 
     with atomic_folder(out.absolute()) as partial:
-        name = f"osel_sim/{task.name}"
+        name = f"osel_sim/{task.replace(':', '_')}"
         aggregate_datasets([name] * len(folders), name, roots=folders, aggr_root=partial, concatenate_data=False)
         (partial / "meta" / SIDE_FILE).write_text(json.dumps(side, indent=1))

@@ -27,6 +27,8 @@ BURST_SCALE = np.array([0.9, 0.9, 0.6, 0.1, 0.1, 0.3, 0.0])
 """Largest push of a burst, in units of action; the gripper's command is never disturbed."""
 NOWHERE = 9.0
 """Column and row of a thing that an image does not show."""
+DONE = "done.json"
+"""What a finished shard says of itself."""
 LENGTH_LIMIT = 1.6
 """A demonstration may take this many horizons: recovering takes time."""
 
@@ -46,6 +48,10 @@ class Shard:
 
     def __str__(self) -> str:
         return self.folder.name
+
+    def record(self) -> tuple[int, int, list[int]]:
+        """Record it (`record_shard`)."""
+        return record_shard(self)
 
 
 def features(task: TaskSpec, image_size: int) -> dict[str, dict[str, Any]]:
@@ -93,7 +99,7 @@ def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
     Returns:
         Frames recorded, episodes recorded, and the seeds the expert failed on (those are left out).
     """
-    done = shard.folder / "done.json"
+    done = shard.folder / DONE
     if done.is_file():
         report = read_json(done)
         return report["frames"], report["episodes"], report["failed"]

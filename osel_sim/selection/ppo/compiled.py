@@ -152,7 +152,8 @@ def _tower(state: dict[str, NDArray[np.float32]], hidden: str, output: str) -> T
     matrices = [state[f"{name}.weight"] for name in names]
     flat = np.concatenate([part.ravel() for name in names for part in (state[f"{name}.weight"], state[f"{name}.bias"])]).astype(np.float32)
     sizes = np.array([matrices[0].shape[1], *(len(matrix) for matrix in matrices)], np.int64)
-    first, second, weights = _aligned(flat.shape), _aligned(flat.shape), _aligned(flat.shape)
+    # Together, because numpy asks for large pages where an array has 4 MB or more.
+    weights, first, second = (row[: len(flat)] for row in _aligned((3, -(-len(flat) // LINE) * LINE)))
     weights[:] = flat
     return weights, first, second, sizes
 

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import UnknownNameError, UsageError
@@ -13,6 +12,7 @@ from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.random_streams import RandomStreams
 
 if TYPE_CHECKING:
+    import torch
     from stable_baselines3 import PPO
 
 ROLLOUT = ("observations", "actions", "rewards", "values", "log_probs", "episode_starts")
@@ -78,6 +78,8 @@ class PPOSelector(SelectorBase):
         layers: Sequence[int] = (768, 512, 128, 64, 16),
         activation: Activation = "tanh",
     ) -> None:
+        import torch
+
         super().__init__(policies, context_dim, seed)
         # Normalising the advantage of a single decision divides by nothing (SB3 issue 440).
         for setting, value, least in (
@@ -144,6 +146,7 @@ class PPOSelector(SelectorBase):
         return self._random
 
     def _build(self, policies: Sequence[str]) -> "PPO":
+        import torch
         from stable_baselines3 import PPO
         from stable_baselines3.common.logger import Logger
 
@@ -160,6 +163,8 @@ class PPOSelector(SelectorBase):
         return algorithm
 
     def _select(self, context: Context) -> Choice:
+        import torch
+
         network = self._algorithm.policy
         self._input.numpy()[0] = context
         with self._random.in_use(), torch.no_grad():
@@ -171,6 +176,8 @@ class PPOSelector(SelectorBase):
         return Choice(self.policies[int(action)], propensities, {"value": value.item(), "log_probability": log_probability.item()})
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
+        import torch
+
         if len(choice.propensities) != len(self.policies):
             return  # chosen before the last add_policy: see _add_policy
         if not {"value", "log_probability"} <= choice.details.keys():
@@ -202,6 +209,8 @@ class PPOSelector(SelectorBase):
         return {**state, **counters, **self._random.state()}
 
     def _load(self, state: State) -> None:
+        import torch
+
         algorithm = self._algorithm
         algorithm.policy.load_state_dict({key: torch.tensor(state[f"network.{key}"]) for key in algorithm.policy.state_dict()})
         optimizer = algorithm.policy.optimizer

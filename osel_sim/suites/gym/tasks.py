@@ -48,8 +48,12 @@ class GymTask:
 
 def unpacked(text: str) -> GymTask:
     """What `packed` gave."""
-    data: dict[str, Any] = json.loads(text)
-    return GymTask(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
+    return _task(json.loads(text))
+
+
+def _task(data: Mapping[str, Any]) -> GymTask:
+    values: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
+    return GymTask(**values)
 
 
 def load_tasks(folder: Path | None = None) -> dict[str, GymTask]:
@@ -99,4 +103,4 @@ def read_task(file: Path) -> GymTask:
     for key in ("control_hz", "horizon"):
         if data.get(key, 1) <= 0:
             raise ContentError(file, key, f"must be positive, got {data[key]!r}")
-    return GymTask(**{key: tuple(value) if isinstance(value, list) else value for key, value in data.items()})
+    return _task(data)

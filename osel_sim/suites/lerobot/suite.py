@@ -4,6 +4,7 @@ import functools
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from osel_sim.interface.suite import NO_SNAPSHOTS, SuiteSpec, TaskInfo
 from osel_sim.suites.described import DescribedSuite, Phrasings
@@ -41,6 +42,6 @@ class LeRobot(DescribedSuite):
 
 
 @functools.cache
-def _words() -> dict[str, dict[str, object]]:
+def _words() -> dict[str, dict[str, Any]]:
     with WORDS.open("rb") as handle:
         return tomllib.load(handle)

@@ -1,0 +1,159 @@
+"""Demonstrations of the scripted experts of other suites, as LeRobotDatasets: those of `osel_sim.training.demonstrations` without labels."""
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from osel_sim.core.errors import UsageError
+from osel_sim.core.files import read_json, write_text
+from osel_sim.interface.environment import Environment, EnvironmentSpec, HasExpert
+from osel_sim.interface.suite import Task
+from osel_sim.training.demonstrations import BURST_PROBABILITY, BURST_STEPS, DONE
+
+BURST = 0.9
+"""Largest push of a burst, as a share of half the range of a motion."""
+BURST_HZ = 20.0
+"""Control rate at which bursts are as long as they are there; at others they take as many seconds."""
+CAMERAS = 2
+"""So many of an environment's cameras, the first ones, are recorded where none is named."""
+
+
+@dataclass(frozen=True)
+class SuiteShard:
+    """A run of consecutive training seeds of a task of another suite, recorded and saved together."""
+
+    task: Task
+    folder: Path
+    first_seed: int
+    episodes: int
+    image_size: int
+    levels: tuple[int, ...]
+    axes: Mapping[str, int] = field(default_factory=dict)
+    cameras: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return self.folder.name
+
+    def record(self) -> tuple[int, int, list[int]]:
+        """Record it, unless it is there already. Runs in a worker process.
+
+        Returns:
+            Frames recorded, episodes recorded, and the seeds the expert failed on (those are left out).
+        """
+        if (self.folder / DONE).is_file():
+            report = read_json(self.folder / DONE)
+            return report["frames"], report["episodes"], report["failed"]
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        env = _env(self.task)
+        spec = env.specification
+        dataset = LeRobotDataset.create(
+            f"osel_sim/{self.task.name.replace(':', '_')}",
+            round(spec.control_hz),
+            features(spec, self.cameras, self.image_size),
+            root=self.folder,
+            robot_type=spec.robot.lower(),
+            use_videos=False,
+        )
+        frames, episodes, failed = 0, 0, []
+        for seed in range(self.first_seed, self.first_seed + self.episodes):
+            env.load(self.task.instance(seed, self.levels[seed % len(self.levels)], "train", self.axes))
+            rows = _demonstrate(env, self.cameras, self.image_size, np.random.default_rng([seed, 1]))
+            if rows is None:
+                failed.append(seed)
+                continue
+            for row in rows:
+                dataset.add_frame(row)
+            dataset.save_episode()
+            frames, episodes = frames + len(rows), episodes + 1
+        dataset.finalize()
+        write_text(self.folder / DONE, json.dumps({"frames": frames, "episodes": episodes, "failed": failed}))
+        return frames, episodes, failed
+
+
+def check_expert(task: Task, cameras: tuple[str, ...]) -> tuple[str, ...]:
+    """The cameras to record.
+
+    Args:
+        cameras: those asked for; none: the first that there are.
+
+    Raises:
+        UsageError: the task has no scripted expert, or an unknown camera is asked for.
+    """
+    from osel_sim.core.errors import UnknownNameError
+
+    spec = task.specification
+    if not spec.expert:
+        raise UsageError(f"task {task.name!r} has no scripted expert, so there is nobody to demonstrate it")
+    for camera in cameras:
+        if camera not in spec.cameras:
+            raise UnknownNameError("camera", camera, spec.cameras, f"the environment of {spec.name}")
+    return cameras or spec.cameras[:CAMERAS]
+
+
+def features(spec: EnvironmentSpec, cameras: tuple[str, ...], image_size: int) -> dict[str, dict[str, Any]]:
+    """The dataset's columns."""
+    images = {
+        f"observation.images.{camera}": {"dtype": "image", "shape": (image_size, image_size, 3), "names": ["height", "width", "channel"]}
+        for camera in cameras
+    }
+    state = {"observation.state": {"dtype": "float32", "shape": (spec.state_size,), "names": None}} if spec.state else {}
+    action = {"action": {"dtype": "float32", "shape": (spec.action.dimension,), "names": list(spec.action.names)}}
+    return {**images, **state, **action, "annotation.noise": {"dtype": "float32", "shape": (1,), "names": None}}
+
+
+def suite_side_file(task: Task, levels: tuple[int, ...], axes: Mapping[str, int], shards: int, episodes: int, failed: list[int]) -> dict[str, Any]:
+    """What a LeRobotDataset has no column for (`meta/osel_sim.json`)."""
+    return {
+        "task": task.name,
+        "task_version": task.info.digest,
+        "robot": task.specification.robot,
+        "levels": list(levels),
+        "axes": dict(axes),
+        "split": "train",
+        "seeds": episodes,
+        "shards": shards,
+        "failed_seeds": failed,
+    }
+
+
+def _env(task: Task) -> Environment:
+    """A worker's environment: opening one takes seconds. The last one is kept."""
+    if task.name not in _open:
+        while _open:
+            _open.popitem()[1].close()
+        _open[task.name] = task.open()
+    return _open[task.name]
+
+
+_open: dict[str, Environment] = {}
+
+
+def _demonstrate(env: Environment, cameras: tuple[str, ...], image_size: int, rng: np.random.Generator) -> list[dict[str, Any]] | None:
+    """Frames of one demonstration on the loaded instance, or None if the expert fails. `action` is the expert's clean one, whatever was executed."""
+    if not isinstance(env, HasExpert):
+        raise UsageError(f"the environment of {env.specification.name} has no scripted expert")
+    spec = env.specification
+    action_spec, expert = spec.action, env.expert()
+    shortest, longest = (round(steps * spec.control_hz / BURST_HZ) for steps in BURST_STEPS)
+    rows: list[dict[str, Any]] = []
+    burst, left = np.zeros(action_spec.dimension), 0
+    while not env.success:
+        if env.done:
+            return None
+        action = action_spec.clip(np.asarray(expert.act(), np.float64))
+        if left == 0 and rng.random() < BURST_PROBABILITY * BURST_HZ / spec.control_hz:
+            burst = np.zeros(action_spec.dimension)
+            burst[action_spec.motions] = BURST * action_spec.half_range[action_spec.motions] * rng.uniform(-1, 1, len(action_spec.motions))
+            left = int(rng.integers(shortest, longest))
+        rows.append({**env.observe(cameras, image_size), "action": action, "annotation.noise": np.array([float(left > 0)], np.float32)})
+        env.advance(action_spec.clip(action + burst) if left > 0 else action)
+        left = max(0, left - 1)
+    return rows
