@@ -82,7 +82,7 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     NotebookClient(notebook, timeout=900, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}).execute()
     shown = [output for cell in notebook.cells for output in cell.get("outputs", [])]
     texts = "".join(output.get("text", "") + str(output.get("data", {})) for output in shown)
-    assert "oute" in texts  # the verdict: Route with ..., or Do not route
+    assert any(answer in texts for answer in ("Route with", "Do not route", "Not enough data to tell"))
     assert "report.html" in texts
     assert any("vegalite" in kind for output in shown for kind in output.get("data", {}))
 

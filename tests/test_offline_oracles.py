@@ -118,6 +118,21 @@ def test_what_other_instances_tell_is_found(truth: str):
     assert 0.55 + 0.2 < found.predictable.mean() < 0.9 + 0.02, found.router
 
 
+def test_repeated_texts_tell_as_much_as_all_their_rows() -> None:
+    """Sixty questions in ten rows each: a selector that reads them has seen nine rows of a text at the end, and must not pass the oracle."""
+    generator, ahead = np.random.default_rng(3), []
+    for _ in range(5):
+        kind = np.repeat(np.arange(60), 10)
+        rates = np.where(generator.random(60)[kind, None] < 0.5, (0.8, 0.4), (0.4, 0.8))
+        log = made(np.eye(64)[kind], generator, rates, instruction=kind)
+        found, means = oracles(log, FREE), log.mean_rewards(FREE)
+        sums = np.stack([np.bincount(kind, weights=column) for column in means.T], axis=1)[kind] - means
+        reader = means[np.arange(600), (sums + 4.0 * means.mean(axis=0)).argmax(axis=1)]
+        assert "groups by instruction" in found.routed
+        ahead.append(found.predictable.mean() - reader.mean())
+    assert np.mean(ahead) > -0.01
+
+
 def test_what_tells_nothing_gains_nothing():
     """Whatever the rates and the contexts' length: never beyond its error, and on average the best single policy's reward."""
     apart, beyond = [], 0

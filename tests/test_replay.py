@@ -361,6 +361,9 @@ def test_ctrl_c_waits_for_what_is_written_together():
         (["--encoder", "clip"], "no contexts of encoder 'clip'"),
         (["--half", "all"], "unknown value 'all'"),
         (["--worker", "1"], "did you mean '--workers'?"),
+        (["--selectors", "auto", "ppo", "--route-with", "pppo"], "unknown selector 'pppo': did you mean 'ppo'?"),
+        (["--selectors", "random", "--route-with", "random"], "unknown selector 'random'"),
+        (["--margin", "-1"], "margin"),
     ],
 )
 def test_wrong_input_is_one_line(log, tmp_path, capsys, arguments, message):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.cross_fit import Rows, cross_fit
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
-from osel_sim.analysis.routers import SINGLE, Router, group_numbers, routers
+from osel_sim.analysis.routers import BY_TEXT, SHRINK, SINGLE, TEXT, Router, group_numbers, routers
 from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
 
@@ -114,15 +114,38 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
         parts = [(by & part, by & ~part) for part in (quarter, ~quarter)]
         tried = {name: np.concatenate([_received(means, router, *part) for part in parts]) for name, router in found.items()}
         best = max(tried, key=lambda name: float(tried[name].sum()))  # the first, which knows least, where several are equal
-        ahead = tried[best] - tried[SINGLE]
-        used.append(best if len(ahead) and ahead.sum() > ahead.std() * np.sqrt(len(ahead)) else SINGLE)
+        if not _is_ahead(tried[best] - tried[SINGLE]):
+            best = SINGLE
+        elif BY_TEXT in found and not _is_ahead(tried[best] - tried[BY_TEXT]):
+            best = BY_TEXT  # with all rows of a text it is better than here, with a quarter of them
+        used.append(best)
         return np.stack([_received(means, router, by, on) for router in found.values()], axis=1)
 
     with threadpool_limits(1):  # the last bits of a matrix product depend on the number of threads
         table = cross_fit(~half, decide)
     routed = dict(zip(found, table.T, strict=True))
+    if BY_TEXT in routed:
+        routed[BY_TEXT] = _by_other_rows_of_the_text(log, means)
     value = np.where(half, routed[used[1]], routed[used[0]])
     return value, dict(zip(("first", "second"), used, strict=True)), {name: own for name, own in routed.items() if name != SINGLE}
+
+
+def _is_ahead(differences: Array) -> bool:
+    """By more than the standard error."""
+    return bool(len(differences) and differences.sum() > differences.std() * np.sqrt(len(differences)))
+
+
+def _by_other_rows_of_the_text(log: LoggedOutcomes, means: Array) -> Array:
+    """Reward on every instance, (N,), of the policy that is best on all others of the same text.
+
+    A selector that reads texts learns of one from all of its rows that come before. Half of the log has half of them, and what it says of a text that
+    stands in ten rows would lie below what the selector comes to.
+    """
+    groups = group_numbers([log.labels(TEXT)], len(log))
+    others = (means.sum(axis=0) - means) / max(len(log) - 1, 1)
+    sums = np.stack([np.bincount(groups, weights=column) for column in means.T], axis=1)
+    beliefs = (sums[groups] - means + SHRINK * others) / (np.bincount(groups)[groups] - 1.0 + SHRINK)[:, None]
+    return np.asarray(means[np.arange(len(log)), beliefs.argmax(axis=1)], np.float64)
 
 
 def _received(means: Array, router: Router, by: Rows, on: Rows) -> Array:

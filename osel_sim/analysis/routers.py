@@ -24,6 +24,9 @@ GROUPINGS = ("task", "target", "container", "phrasing", "robot")
 TEXT = "instruction"
 """Instances of the same text are a group as well."""
 
+BY_TEXT = f"groups by {TEXT}"
+"""The router that goes by them."""
+
 SHRINK = 4.0
 """A group's mean rewards count as if so many more instances of the group had the mean of all: a small group says little."""
 

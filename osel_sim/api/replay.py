@@ -135,6 +135,9 @@ class _Replay:
         config, folder = self.config, self.config.folder
         named = None if config.selectors is None else [name for name in config.selectors if name not in self.factories]
         selectors = [*choose_selectors(named, halved=config.half is not None), *self.factories]
+        for name in config.route_with or ():
+            if name not in selectors or name == "random":
+                raise UnknownNameError("selector", name, set(selectors) - {"random"}, "--route-with names selectors that are replayed")
         check_replay_folder(folder, config.overwrite)
         if not is_live_run(config.log):
             log = read_log(config.log, None if config.encoder == AUTO else config.encoder)
