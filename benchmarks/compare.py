@@ -118,13 +118,14 @@ def sequential(kind: Kind, instances: int, runs: int, seed: int = 0) -> dict[str
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="instances")
     parser.add_argument("--runs", type=int, default=2000, help="made-up logs of each kind and size; a tenth where there are repeats")
     options = parser.parse_args()
     result: dict[str, dict[str, dict[str, float]]] = {}
-    with progress(len(KINDS) * len(SIZES) * (len(REPEATS) + 1), "size", "compare") as bar:
+    with progress(len(KINDS) * len(options.sizes) * (len(REPEATS) + 1), "size", "compare") as bar:
         for name, kind in KINDS.items():
             own = result[name] = {}
-            for size in SIZES:
+            for size in options.sizes:
                 for repeats in REPEATS:
                     like = kind if repeats == 1 else noisy(kind)
                     own[f"{size} x {repeats}"] = simulate(like, size, repeats, options.runs if repeats == 1 else max(options.runs // 10, 1))

@@ -17,6 +17,7 @@ from osel_sim.analysis.live import is_live_run, read_live
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError, OselError
 from osel_sim.episodes.live import LiveOptions, LiveRun
+from osel_sim.formats.journal import line_digest
 from osel_sim.formats.rollout_log import ROLLOUTS, read_rollouts, write_rollouts
 from osel_sim.formats.run_config import check_run_folder
 from osel_sim.formats.shards import SHARDS, Shards
@@ -236,6 +237,28 @@ def test_going_on_with_a_journal_that_lost_decisions_overwrites_nothing(copy: Pa
     with pytest.raises(DataError, match=f"{beside}.*the journal lost decisions; put it back"):
         LiveRun(copy, (), None, None, None, options)
     assert {file.name: file.read_bytes() for file in copy.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["episodes.jsonl", "counterfactual.jsonl"])
+def test_a_line_that_is_not_what_was_written_is_told_however_plausible(copy: Path, name: str) -> None:
+    """Steps, texts and low digits are as good as any; their checksums lie in timing.jsonl, of which nothing else is asked."""
+    names = ("episodes.jsonl", "counterfactual.jsonl")
+    rows = {key: [json.loads(line) for line in (copy / key).read_text().splitlines()] for key in names}
+    checksums = [{key: line_digest(rows[key][at]) for key in names} for at in range(6)]
+    (copy / "timing.jsonl").write_text("".join(json.dumps({"index": at, "checksums": own}) + "\n" for at, own in enumerate(checksums)))
+    assert len(read_live(copy).decisions) == 6
+    file = copy / name
+    whole = file.read_text()
+    lines = whole.splitlines(keepends=True)
+    lines[2] = lines[2].replace('"steps": 40', '"steps": 41', 1)
+    assert "".join(lines) != whole
+    file.write_text("".join(lines))
+    with pytest.raises(DataError, match=rf"{name}, line 3: is not what was written \(timing\.jsonl has its checksum\)"):
+        read_live(copy)
+    with pytest.raises(DataError, match="line 3: is not what was written"):
+        LiveRun(copy, (), None, None, None, LiveOptions(0, WEIGHTS, counterfactual=True))
+    (copy / "timing.jsonl").write_bytes(b"\xff{\n" + b'{"index": "x"}\n' * 3)
+    assert len(read_live(copy).decisions) == 6  # nobody knows then
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from osel_sim.formats.task_file import load_task_file
 from osel_sim.ingestion.columns_file import load_columns
 from osel_sim.policy.registry import kinds
 from osel_sim.selection.registry import selector_locations
+from osel_sim.suites.gym.tasks import read_task
 from osel_sim.suites.registry import select_tasks
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -92,6 +93,8 @@ def test_toml_blocks_are_valid_files(block: Block, tmp_path: Path) -> None:
     file.write_text(block.text)
     if "scene" in data:
         load_task_file(file)
+    elif "id" in data:
+        read_task(file)
     elif "kind" in data:
         assert load_policy_file(file).kind in kinds()
     elif "table" in data:

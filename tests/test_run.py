@@ -103,7 +103,7 @@ def test_killed_and_resumed_filmed_or_not_gives_the_same_bytes(world, reference,
     folder = world / f"killed-{trial}"
     arguments = ["--episodes", EPISODES if trial else EPISODES - 1, "--counterfactual", "--out", folder]
     for attempt in range(1 + trial):
-        flags = [*(["--resume"] if attempt else []), *(["--video", "2", "--view"] if attempt == 0 else [])]
+        flags = ["--resume"] if attempt else ["--video", "2", *(["--view"] if trial else [])]
         process = subprocess.Popen(
             command(world, "run", *arguments, *flags), env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         )

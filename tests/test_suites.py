@@ -596,3 +596,23 @@ def test_the_doctor_and_the_gallery_know_it(execute):
     assert "camera top, 64 x 64 pixels" in printed and "position:" in printed
     execute("gallery", "--task", "toy:all", "--size", 64, "--out", "sheet.png")
     assert "unknown camera 'wrist': known: top" in execute("gallery", "--task", "toy:reach", "--camera", "wrist", "--out", "x.png", code=2)
+
+
+def test_lerobots_evaluator_gets_its_tasks_too():
+    from lerobot.envs.utils import NEW_ROLLOUT_OPTION
+
+    from osel_sim.suites.lerobot_env import OselSimEnv
+
+    config = OselSimEnv(task="toy:reach,toy:hurry", image_size=32)
+    assert config.fps == 10 and set(config.features) == {"action", "observation.state", "observation.images.top"}
+    for name, group in config.create_envs(2).items():
+        (envs,) = group.values()
+        observation, _ = envs.reset(seed=[3, 4], options={NEW_ROLLOUT_OPTION: True})
+        assert observation["pixels"]["top"].shape == (2, 32, 32, 3) and observation["agent_pos"].shape == (2, 2)
+        assert envs.call("task") == (name, name) and all(text.startswith("move") for text in envs.call("task_description"))
+        for _ in range(envs.call("_max_episode_steps")[0]):
+            ended = envs.step(np.ones((2, 2), np.float32))
+        assert (ended[2] | ended[3]).all() and "is_success" in ended[4]
+        envs.close()
+    with pytest.raises(UsageError, match="cannot be mixed"):
+        OselSimEnv(task="toy:reach,lift")

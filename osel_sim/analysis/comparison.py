@@ -29,8 +29,9 @@ def compare(contenders: Sequence[Contender], weights: RewardWeights, margin: flo
         DataError: two of them have no instance in common, or the logs do not fit together.
     """
     paired = [pair(one, other, weights) for one, other in combinations(contenders, 2)]
-    probabilities = holm([_probability(pairs) for pairs in paired])
-    found = [_compared(pairs, adjusted, len(paired), margin, power) for pairs, adjusted in zip(paired, probabilities, strict=True)]
+    probabilities = [_probability(pairs) for pairs in paired]
+    tested = zip(paired, probabilities, holm(probabilities), strict=True)
+    found = [_compared(pairs, (probability, adjusted), len(paired), margin, power) for pairs, probability, adjusted in tested]
     first = contenders[0].name
     decisions: list[Decision] = [entry["verdict"]["decision"] for entry in found if entry["first"] == first]
     decision: Decision = next(one for one in ("worse", "not enough data", "no worse", "better") if one in decisions)
@@ -52,7 +53,8 @@ def compare(contenders: Sequence[Contender], weights: RewardWeights, margin: flo
 
 def compare_pairs(pairs: Pairs, margin: float, power: float = 0.8) -> dict[str, Any]:
     """Two policies alone, as an entry of `pairs` in `compare.json`."""
-    return _compared(pairs, _probability(pairs), 1, margin, power)
+    probability = _probability(pairs)
+    return _compared(pairs, (probability, probability), 1, margin, power)
 
 
 def plan(contenders: Sequence[Contender], weights: RewardWeights, detect: float, margin: float, power: float = 0.8) -> list[dict[str, Any]]:
@@ -85,7 +87,8 @@ def plan(contenders: Sequence[Contender], weights: RewardWeights, detect: float,
     return found
 
 
-def _compared(pairs: Pairs, adjusted: float, comparisons: int, margin: float, power: float) -> dict[str, Any]:
+def _compared(pairs: Pairs, probabilities: tuple[float, float], comparisons: int, margin: float, power: float) -> dict[str, Any]:
+    """One pair of policies; `probabilities`: of the test, alone and with Holm's correction."""
     differences = pairs.differences()
     whole = bool(np.isin(differences, (-1.0, 0.0, 1.0)).all() and np.isin(pairs.first_values["success"], (0.0, 1.0)).all())
     measured = {name: entry for name in MEASURES if name in pairs.first_values and (entry := _difference(pairs, name)) is not None}
@@ -104,8 +107,8 @@ def _compared(pairs: Pairs, adjusted: float, comparisons: int, margin: float, po
             "method": _method(pairs, whole),
             "gained": int((differences > 0.0).sum()),
             "lost": int((differences < 0.0).sum()),
-            "p": _probability(pairs),
-            "p_holm": adjusted,
+            "p": probabilities[0],
+            "p_holm": probabilities[1],
         },
         "tasks": _tasks(pairs),
         "flips": [
@@ -113,7 +116,7 @@ def _compared(pairs: Pairs, adjusted: float, comparisons: int, margin: float, po
             for row, (one, other) in enumerate(zip(pairs.first_values["success"], pairs.second_values["success"], strict=True))
             if one != other
         ],
-        "verdict": _verdict(pairs, adjusted, comparisons, margin, power),
+        "verdict": _verdict(pairs, probabilities[1], comparisons, margin, power),
     }
 
 

@@ -13,7 +13,7 @@ from osel_sim.context.cache import FILE, ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
 from osel_sim.formats.counterfactual import COUNTERFACTUAL, to_others
-from osel_sim.formats.journal import JOURNAL, SEEDS_PER_RUN, TIMING, Decision, check_beside, read_journal, read_lines
+from osel_sim.formats.journal import JOURNAL, SEEDS_PER_RUN, TIMING, Decision, check_beside, check_digests, read_journal, read_lines
 from osel_sim.formats.rollout_log import ROLLOUTS, Row
 from osel_sim.formats.run_config import RUN, read_run
 from osel_sim.formats.summary import SUMMARY
@@ -70,6 +70,8 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     journal = read_journal(folder / JOURNAL)
     for name in (COUNTERFACTUAL, TIMING):
         check_beside(folder / name, len(journal))
+    for name in (JOURNAL, COUNTERFACTUAL):
+        check_digests(folder / name)
     decisions = _as_far_as_contexts(folder, journal, encoder or configuration.get("encoder"))
     if not decisions:
         raise DataError(f"{folder / JOURNAL}: the run made no decision")

@@ -18,7 +18,19 @@ from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
 from osel_sim.episodes.view import view
 from osel_sim.formats.counterfactual import COUNTERFACTUAL, Others, to_others
-from osel_sim.formats.journal import JOURNAL, SEEDS_PER_RUN, TIMING, Decision, Lines, as_read, check_beside, read_lines, to_decision
+from osel_sim.formats.journal import (
+    JOURNAL,
+    SEEDS_PER_RUN,
+    TIMING,
+    Decision,
+    Lines,
+    as_read,
+    check_beside,
+    check_digests,
+    line_digest,
+    read_lines,
+    to_decision,
+)
 from osel_sim.formats.summary import check_summary
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.instance import Instance
@@ -87,6 +99,8 @@ class LiveRun:
         check_beside(folder / COUNTERFACTUAL, len(self.decisions), complete=options.counterfactual, going_on=True)
         check_beside(folder / TIMING, len(self.decisions), going_on=True)
         check_summary(folder, len(self.decisions))
+        for name in (JOURNAL, COUNTERFACTUAL):
+            check_digests(folder / name)
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
         self._rows: list[list[float]] = []
@@ -158,15 +172,17 @@ class LiveRun:
         decision = self._decision(index, instance, choice, outcome, start.scene if self._tells_scenes else None)
         # What a suite or a selector of others got wrong is told now, not when the journal is read.
         to_decision(as_read(decision.to_dict(), f"{self._journal.file}, line {index + 1}"), index, self._journal.file)
-        rewards = {choice.policy: decision.reward}
+        rewards, checksums = {choice.policy: decision.reward}, {JOURNAL: line_digest(decision.to_dict())}
         if self._others is not None:
             found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in self.policies if policy != choice.policy}
             others = Others(index, found, {policy: self._reward(other) for policy, other in found.items()})
             rewards |= others.rewards
             self._checked_others(as_read(others.to_dict(), f"{self._others.file}, line {index + 1}"), index, choice.policy)
             self._others.append(others.to_dict())
+            checksums[COUNTERFACTUAL] = line_digest(others.to_dict())
         for subscriber in self.subscribers:
             subscriber.on_decision(decision, rewards)
+            subscriber.on_lines(index, checksums)
         # The journal comes last: what it does not have did not happen.
         self._journal.append(decision.to_dict())
         self.decisions.append(decision)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, override
+from typing import Any, Protocol, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,13 @@ class RunSubscriber:
             rewards: of every policy that ran, None where an episode ended in an error.
         """
 
+    def on_lines(self, index: int, checksums: Mapping[str, str]) -> None:
+        """The lines of a decision are about to be on disk, all but the journal's.
+
+        Args:
+            checksums: file -> that of its line (`osel_sim.formats.journal.line_digest`).
+        """
+
     def on_end(self, run: Run) -> None:
         """The run is over or interrupted, and all of its files are written. Not told after an error."""
 
@@ -79,12 +86,13 @@ class RunSubscriber:
 
 
 class TimingFile(RunSubscriber):
-    """Writes `timing.jsonl`: what decisions and their episodes really took on this machine."""
+    """Writes `timing.jsonl`: what decisions and their episodes really took on this machine, and checksums of the lines beside it."""
 
     def __init__(self) -> None:
         self._lines: Lines | None = None
         self._start = self._chosen = 0.0
         self._episodes: dict[str, Timing] = {}
+        self._row: dict[str, Any] = {}
 
     @override
     def on_start(self, run: Run) -> None:
@@ -105,15 +113,17 @@ class TimingFile(RunSubscriber):
 
     @override
     def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:
+        self._row = {
+            "index": decision.index,
+            "seconds": time.perf_counter() - self._start,
+            "context_and_choice": self._chosen - self._start,
+            "episodes": {policy: {"seconds": timing.seconds, "calls": timing.calls} for policy, timing in self._episodes.items()},
+        }
+
+    @override
+    def on_lines(self, index: int, checksums: Mapping[str, str]) -> None:
         if self._lines is not None:
-            self._lines.append(
-                {
-                    "index": decision.index,
-                    "seconds": time.perf_counter() - self._start,
-                    "context_and_choice": self._chosen - self._start,
-                    "episodes": {policy: {"seconds": timing.seconds, "calls": timing.calls} for policy, timing in self._episodes.items()},
-                }
-            )
+            self._lines.append({**self._row, "checksums": dict(checksums)})
 
     @override
     def close(self) -> None:

@@ -4,6 +4,7 @@ A process killed in the middle of a write leaves at most one torn last line, whi
 order of the dataclass and floats in Python's shortest exact form, so that equal decisions are equal bytes.
 """
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from osel_sim.core.errors import DataError
+from osel_sim.core.files import content_digest
 from osel_sim.core.shown import escaped
 from osel_sim.formats.toml_types import quoted
 from osel_sim.formats.values import DECISION, fault
@@ -185,6 +187,32 @@ def check_beside(file: Path, decisions: int, complete: bool = False, going_on: b
         raise DataError(f"{file} has {lines} lines, {JOURNAL} beside it {decisions}: {LOST}")
     if complete and lines < decisions:
         raise DataError(f"{file}: line {lines + 1} is missing, which the journal has")
+
+
+def line_digest(data: dict[str, Any]) -> str:
+    """Checksum of a line: what `timing.jsonl` has of each of the lines beside it. Journals are the same bytes without."""
+    return content_digest(to_line(data))[:16]
+
+
+def check_digests(file: Path) -> None:
+    """Refuse a file of which a line is another than was written: a flipped bit may leave numbers that are as good as any.
+
+    `timing.jsonl` beside it has the checksums; no result depends on that file, so what it lacks, or has lost, is not checked.
+
+    Raises:
+        DataError: naming file and line.
+    """
+    timing = file.with_name(TIMING)
+    if not (file.is_file() and timing.is_file()):
+        return
+    lines = [raw + b"\n" for raw in file.read_bytes().split(b"\n")[:-1]]
+    for raw in timing.read_bytes().split(b"\n"):
+        with contextlib.suppress(ValueError, RecursionError, TypeError, KeyError, IndexError):
+            row = json.loads(raw)
+            index, digest = row["index"], row["checksums"][file.name]
+            differs = index >= 0 and content_digest(lines[index])[:16] != digest
+            if differs:
+                raise DataError(f"{file}, line {index + 1}: is not what was written ({TIMING} has its checksum)")
 
 
 def to_decision(data: dict[str, Any], index: int, file: Path) -> Decision:

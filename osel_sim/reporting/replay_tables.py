@@ -59,10 +59,9 @@ def selector_table(result: Mapping[str, Any], names: Mapping[str, str]) -> Table
         *(Column(f"regret_{oracle}", f"regret to {word}", digits=3) for oracle, word in ORACLES.items() if oracle in result["oracles"]),
         Column("ahead", "ahead after"),
     ]
-    over = _over_seeds(result)
+    over = _over_what(result)
     caption = (
-        "The best first. Mean reward and success: with 95% bootstrap intervals over instances, of fixed policies over all repeats as in the table of "
-        f"policies. Gap and regret: {over[:1].lower()}{over[1:]} Those of the gap are also over what the expected oracle may be off. "
+        f"The best first. {over} Gap and regret: also over what the expected oracle may be off. "
         "Regret: reward a decision below the oracle. Gap closed: share of the way "
         f"from the best single policy to the {ORACLES.get(learnable, 'learnable oracle')}{'' if predictable else ', also to the predictable one'}; "
         "a dash where there is no gap to close, or none that is more than its error. "
@@ -143,15 +142,18 @@ def paired_tables(result: Mapping[str, Any], names: Mapping[str, str]) -> list[T
         *(Column("selector", "selector", "text"), Column("against", "against", "text")),
         *(Column("difference", "difference in reward", digits=4), Column("late", "in the last quarter", digits=4)),
     ]
-    caption = f"Differences on the same streams; paired.csv of the replay has all pairs. {_over_seeds(result)}"
+    caption = f"Differences on the same streams; paired.csv of the replay has all pairs. {_over_what(result)}"
     return [Table("paired_differences", "Paired differences", caption, columns, rows)]
 
 
-def _over_seeds(result: Mapping[str, Any]) -> str:
+def _over_what(result: Mapping[str, Any]) -> str:
     """What the intervals say."""
-    if len(result["seeds"]) == 1:
-        return "Means with 95% bootstrap intervals over the decisions of the only seed."
-    return "Means with 95% bootstrap intervals over seeds: what another order of the same instances would change, not what other instances would."
+    if result["schema_version"] == 1:
+        return "Means with 95% bootstrap intervals over seeds: what another order of the same instances would change, not what other instances would."
+    return (
+        "Means with 95% intervals over instances: what others of the kind would change, what is learned from them included. "
+        "What another order of the same ones would change is in selectors.csv and paired.csv of the replay (orders_ci95)."
+    )
 
 
 def _signed(estimate: Estimate | float | None, sign: float) -> Estimate | float | None:

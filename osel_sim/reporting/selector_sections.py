@@ -79,7 +79,7 @@ def running_mean(values: Array) -> Array:
 
 
 def curve_figure(streams: Mapping[str, Stream], look: Look, policies: Sequence[str] = ()) -> Figure:
-    """Cumulative mean reward over decisions with bands over seeds (paper, figure 5).
+    """Cumulative mean reward over decisions with bands over orders (paper, figure 5).
 
     Args:
         policies: of a single selector: those it chose among, to show beside the curves how often it chose each.
@@ -92,7 +92,11 @@ def curve_figure(streams: Mapping[str, Stream], look: Look, policies: Sequence[s
     for name, shares in chosen.items():
         parts = {policy: shares[column][at] for column, policy in enumerate(policies)}
         panels.append(stacked("", at + 1, parts, Look(colours(policies)), ("decision", f"chosen by {name} (%)")))
-    band = f" Bands: 95% intervals of the mean over {seeds} seeds." if seeds > 1 else ""
+    band = (
+        f" Bands: the spread over {seeds} orders of the same instances (95% of their mean); the table has intervals over instances."
+        if seeds > 1
+        else ""
+    )
     caption = f"Mean of the rewards up to each decision (the paper's figure 5).{band} Click a name to hide or show it."
     caption += " Right: share of the latest tenth of the decisions in which each policy was chosen." if chosen else ""
     ends = sorted(((float(np.asarray(line.y)[-1]), line.name) for line in lines), reverse=True)
@@ -191,7 +195,7 @@ def gap_figure(gaps: Mapping[str, tuple[Estimate | float | None, Estimate | floa
         return None
     shown.sort(key=lambda name: -max(part[name].value for part in found.values() if name in part))
     scaled = {label: {name: Estimate(100 * own.value, 100 * own.low, 100 * own.high) for name, own in part.items()} for label, part in found.items()}
-    caption = f"0% is the best single policy, 100% the {oracle}. With 95% intervals over seeds and over what the expected oracle may be off."
+    caption = f"0% is the best single policy, 100% the {oracle}. With 95% intervals over instances and over what the expected oracle may be off."
     ends = [f"{name} {scaled['last quarter'][name].value:.0f}%" for name in shown if name in scaled["last quarter"]]
     text = f"Dots with intervals, a row for each selector. Share of the gap to the {oracle} closed in the last quarter: {listed(ends)}."
     look = Look({"whole stream": "muted", "last quarter": "ink"}, shapes={"last quarter": "diamond"})

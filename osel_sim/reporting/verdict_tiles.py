@@ -28,11 +28,13 @@ def shown_verdict(found: Mapping[str, Any], first: Sequence[str] = (), tiles: Se
 
     Args:
         found: as `osel_sim.analysis.answer.answer` returns it.
-        first: sentences that stand before its own.
+        first: sentences that stand before its own, as one paragraph.
         tiles: that stand before its own.
     """
     how = f"Found by showing its instances to {found['stake']['selector']} in {found['orders']} random orders, as osel_sim.replay does."
-    return Verdict(found["headline"], [*first, *found["sentences"], how], [*tiles, *gain_tiles(found)], TONES[found["decision"]])
+    *own, last = found["sentences"]
+    paragraphs = [*([" ".join(first)] if first else []), *own, f"{last} {how}"]
+    return Verdict(found["headline"], paragraphs, [*tiles, *gain_tiles(found)], TONES[found["decision"]])
 
 
 def _between(ends: Sequence[float | None]) -> str:

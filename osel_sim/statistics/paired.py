@@ -17,6 +17,8 @@ from osel_sim.statistics.intervals import Interval
 
 Array = NDArray[np.float64]
 
+CAUTION = 10
+"""So many instances speak beforehand for repeats being all alike: few instances say little of how much repeats are worth."""
 DRAWS = 100_000
 """How often signs are drawn anew where the exact distribution is not at hand."""
 
@@ -206,7 +208,8 @@ def _pairs_an_instance(values: Array, most: float) -> float:
         return 1.0
     # A sample of whole differences has this spread over (N - 1) pairs; it must come to 1 exactly.
     whole = (share - mean * mean) * len(values) / (len(values) - 1)
-    return float(np.clip(whole / spread, 1.0, max(most / len(values), 1.0)))
+    scale = float(np.clip(whole / spread, 1.0, max(most / len(values), 1.0)))
+    return (scale * len(values) + CAUTION) / (len(values) + CAUTION)
 
 
 def _crossing(statistic: Callable[[float], float], low: float, high: float, level: float) -> float:

@@ -81,7 +81,7 @@ class _AnyTask(Mapping[str, TaskInfo]):
         if name in listed:
             return listed[name]
         spec = self._suite.specification(name)
-        return TaskInfo(words_of(name), spec.horizon or 0, content_digest(repr(self._suite.describe(name)))[:12], robot=spec.robot)
+        return TaskInfo(words_of(name), spec.horizon or 0, content_digest(repr(self._suite.describe(name)))[:12])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._suite.listed())

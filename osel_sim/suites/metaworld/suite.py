@@ -43,7 +43,7 @@ class Metaworld:
     def tasks(self) -> Mapping[str, TaskInfo]:
         """Its tasks by name."""
         return {
-            name: TaskInfo(task.title, HORIZON, f"3-{content_digest(repr(asdict(task)))[:12]}", task.tags, AXES, "Sawyer")
+            name: TaskInfo(task.title, HORIZON, f"3-{content_digest(repr(asdict(task)))[:12]}", task.tags, AXES)
             for name, task in load_tasks().items()
         }
 

@@ -17,7 +17,7 @@ from osel_sim.sim.gl import quiet_robosuite
 from osel_sim.sim.light_meshes import lighten
 from osel_sim.suites.base import BaseEnvironment, PlainInstance
 from osel_sim.suites.mujoco_view import MujocoView
-from osel_sim.suites.robosuite.suite import CAMERAS, parts, specification
+from osel_sim.suites.robosuite.tasks import CAMERAS, STOCK, parts, specification
 
 SHOWN = (1, 2)
 """Geom groups; robosuite's collision geoms are in group 0."""
@@ -44,6 +44,7 @@ class RobosuiteEnvironment(BaseEnvironment):
         )  # fmt: skip
         self._model, self._data = self._env.sim.model._model, self._env.sim.data._data
         self._robot = _description(self._env, arm)
+        self._site = self._model.site(self._robot.grip_site).id
         self._control = self._new_control()
         xml = self._env.sim.model.get_xml()
         self._view = MujocoView(
@@ -70,7 +71,11 @@ class RobosuiteEnvironment(BaseEnvironment):
 
     def act(self, action: Actions) -> bool:
         """One control step."""
-        self._control.step(action)
+        if self._control is None:
+            self._env.step(action)
+            self._settle()
+        else:
+            self._control.step(action)
         return bool(self._env._check_success())
 
     def state(self) -> Mapping[str, ArrayLike]:
@@ -78,10 +83,14 @@ class RobosuiteEnvironment(BaseEnvironment):
         import mujoco
 
         quaternion, vector = np.empty(4), np.empty(3)
-        mujoco.mju_mat2Quat(quaternion, self._control.matrix)
+        mujoco.mju_mat2Quat(quaternion, self._data.site_xmat[self._site])
         mujoco.mju_quat2Vel(vector, quaternion, 1.0)
-        first = self._robot.joints
-        return {"position": self._control.position, "axis_angle": vector, "fingers": self._data.qpos[first : first + len(self._robot.gripper.rest)]}
+        arm, hand = self._robot.joints, len(self._robot.gripper.rest)
+        return {
+            "position": self._data.site_xpos[self._site],
+            "axis_angle": vector,
+            "fingers": self._data.qpos[arm : arm + hand],
+        }
 
     def image(self, camera: str, width: int, height: int, quality: str = "fast") -> Image:
         """Image (height, width, 3) of a camera."""
@@ -122,9 +131,11 @@ class RobosuiteEnvironment(BaseEnvironment):
         self._env.close()
 
     def _new_control(self, home: NDArray[np.float64] | None = None) -> Any:
-        """Control whose null space pulls towards where the arm is now, as robosuite's does after its reset."""
+        """Control whose null space pulls towards where the arm is now, as robosuite's does after its reset; None: robosuite's own is to be used."""
         from osel_sim.sim.control import Control
 
+        if self.specification.robot in STOCK:
+            return None
         self._home = np.array(self._data.qpos[: self._robot.joints] if home is None else home)
         return Control(self._model, self._data, self._robot, self._home)
 

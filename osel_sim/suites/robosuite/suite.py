@@ -1,26 +1,14 @@
 """robosuite's stock single-arm environments as a suite: `robosuite:Lift`, `robosuite:Lift/UR5e`."""
 
 import functools
-import tomllib
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 from osel_sim.core.files import content_digest
 from osel_sim.interface.environment import Environment, EnvironmentSpec
-from osel_sim.interface.specification import ACTION, CONTROL_HZ
 from osel_sim.interface.suite import SuiteSpec, TaskInfo
 from osel_sim.suites.base import PlainInstance
 from osel_sim.suites.phrasing import phrase, stream
-
-NAME = "robosuite"
-FILE = Path(__file__).resolve().parent / "tasks.toml"
-HORIZON = 500
-FINGERS = {"Panda": 2, "UR5e": 6, "IIWA": 6, "Jaco": 6, "Kinova3": 6}
-"""Arm -> joints of the gripper that robosuite gives it. Sawyer is not among them: its meshes do not load in MuJoCo 3.9."""
-USUAL = "Panda"
-CAMERAS = {"agentview": "agentview", "wrist": "robot0_eye_in_hand", "frontview": "frontview", "sideview": "sideview", "birdview": "birdview"}
-"""Name of a camera -> robosuite's."""
+from osel_sim.suites.robosuite.tasks import FINGERS, HORIZON, NAME, USUAL, parts, specification, words
 
 
 class Robosuite:
@@ -38,11 +26,9 @@ class Robosuite:
     def tasks(self) -> Mapping[str, TaskInfo]:
         """Every environment with every arm; the Panda's need not be named."""
         return {
-            _task(name, arm): TaskInfo(
-                entry["title"], entry.get("horizon", HORIZON), f"1-{content_digest(repr(entry))[:12]}", (arm.lower(),), robot=arm
-            )
+            _task(name, arm): TaskInfo(entry["title"], entry.get("horizon", HORIZON), f"1-{content_digest(repr(entry))[:12]}", (arm.lower(),))
             for arm in FINGERS
-            for name, entry in _words().items()
+            for name, entry in words().items()
         }
 
     def specification(self, task: str) -> EnvironmentSpec:
@@ -52,7 +38,7 @@ class Robosuite:
     def instance(self, task: str, seed: int, level: int, split: str, axes: Mapping[str, int]) -> PlainInstance:
         """Draw an instance: a seed for robosuite, and a phrasing. An arm changes neither."""
         name = parts(task)[0]
-        entry = _words()[name]
+        entry = words()[name]
         phrasing, instruction = phrase(entry["train"], entry["held_out"], split, stream(name, seed, split))
         return PlainInstance(f"{NAME}:{task}", seed, split, instruction, level, phrasing=phrasing)
 
@@ -63,33 +49,5 @@ class Robosuite:
         return RobosuiteEnvironment(task)
 
 
-def parts(task: str) -> tuple[str, str]:
-    """Environment and arm."""
-    name, _, arm = task.partition("/")
-    return name, arm or USUAL
-
-
-def specification(task: str) -> EnvironmentSpec:
-    """What the environment of a task offers policies."""
-    name, arm = parts(task)
-    return EnvironmentSpec(
-        name=NAME,
-        control_hz=CONTROL_HZ,
-        action=ACTION,
-        state={"position": 3, "axis_angle": 3, "fingers": FINGERS[arm]},
-        cameras=tuple(CAMERAS),
-        context_camera="agentview",
-        robot=arm,
-        horizon=_words()[name].get("horizon", HORIZON),
-        snapshots=True,
-    )
-
-
 def _task(name: str, arm: str) -> str:
     return name if arm == USUAL else f"{name}/{arm}"
-
-
-@functools.cache
-def _words() -> dict[str, dict[str, Any]]:
-    with FILE.open("rb") as handle:
-        return tomllib.load(handle)
