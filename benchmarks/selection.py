@@ -185,7 +185,8 @@ def main() -> None:
             ahead = [regrets[name] - regrets[other] for other in options.selectors if other != name]
             unbeaten[name] += all(gap.mean() <= 1.96 * _error(gap) for gap in ahead)
         cells = (_cell(found[problem][name]) for name in options.selectors)
-        print(f"| {Path(problem).name} | {some[0].decisions} | {found[problem]['best_single']:.0f} | {' | '.join(cells)} |")
+        name = problem if problem in PROBLEMS else Path(problem).name
+        print(f"| {name} | {some[0].decisions} | {found[problem]['best_single']:.0f} | {' | '.join(cells)} |")
     overall = {
         name: {
             "regret_per_1000": round(float(np.mean([1e3 * own[name]["regret"] / own["decisions"] for own in found.values()])), 2),

@@ -366,6 +366,8 @@ def test_a_change_that_nobody_announced_is_noticed_and_what_was_before_forgotten
 def test_where_nothing_changes_nothing_is_forgotten():
     for seed in range(4):
         contexts, rewards, _ = clusters(seed, 300)  # what is chosen changes while it is learned, and with it what each policy earns
-        selector = make_selector("auto", POLICIES, 40, seed=seed)
-        play(selector, contexts, rewards)
-        assert len(selector.state_dict()["targets"]) == 300
+        noises = (np.random.default_rng(seed).random((300, 3)) < (0.99, 0.9, 0.5)).astype(float)  # the first hardly varies
+        for table in (rewards, noises):
+            selector = make_selector("auto", POLICIES, 40, seed=seed)
+            play(selector, contexts, table)
+            assert len(selector.state_dict()["targets"]) == 300

@@ -14,7 +14,7 @@ from osel_sim.core.files import content_digest
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.features import Array, Features, Part, Sketch
-from osel_sim.selection.regression import Moments, SharedRegression, fit
+from osel_sim.selection.regression import NOISE_WEIGHT, Moments, SharedRegression, fit
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
 from osel_sim.statistics.best import probability_of_best
 
@@ -260,7 +260,10 @@ class BayesianSelector(SelectorBase):
         heads = np.array(self._heads[: len(targets)], np.float64)
         rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
         left = targets - heads @ self._guess - (rows * self._regression.weights[chosen]).sum(axis=1)
-        left /= math.sqrt(self._regression.noise)
+        # A success rate near 1 varies less than others: a policy is measured by its own noise, where that is more than the others'.
+        noise, tried = self._regression.noise, np.bincount(chosen, minlength=len(self._counts))
+        own = (NOISE_WEIGHT * noise + np.bincount(chosen, left**2, len(self._counts))) / (NOISE_WEIGHT + tried)
+        left /= np.sqrt(np.maximum(own, noise))[chosen]
         piece = np.searchsorted(starts, np.arange(len(chosen)), side="right")
         counts, sums = np.zeros((2, PIECES, len(self._counts)))
         np.add.at(counts, (piece, chosen), 1.0)

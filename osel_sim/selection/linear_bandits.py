@@ -39,7 +39,8 @@ class LinUCBSelector(LinearSelector):
     """Chooses the policy whose reward is highest at `optimism` deviations above its mean (Li et al. 2010). Arguments: `LinearSelector`, `Prior`.
 
     As published it can stay with a worse policy for good: where the first tries of the better one were bad luck its bound lies below the other's, and
-    no bound of a policy changes while it is not chosen. `auto` and `lints` choose by chance and come back.
+    no bound of a policy changes while it is not chosen (in `benchmarks/selection.py` 5 of 12 seeds after an unlucky start, 2 of 12 among three
+    policies 0.1 apart). `auto` and `lints` choose by chance and come back.
     """
 
     name: ClassVar[str] = "linucb"
@@ -69,7 +70,8 @@ class LinTSSelector(LinearSelector):
     """Chooses the policy whose reward is highest in a draw from what is believed (Agrawal and Goyal 2013). Arguments: `LinearSelector`, `Prior`.
 
     `chance` scales the deviation of the draws where it is the context's; that of a policy's mean is drawn from in full. 1 is Thompson sampling
-    proper, which explores more than some thousand decisions repay.
+    proper, which explores more than some thousand decisions repay. Without context it stays with a worse policy only where there are too few
+    decisions to tell (in `benchmarks/selection.py` 3 of 12 seeds of 16 policies in 400 decisions, as `thompson` does).
     """
 
     name: ClassVar[str] = "lints"

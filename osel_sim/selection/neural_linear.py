@@ -19,6 +19,8 @@ STEPS, RATE, DECAY = 150, 0.02, 1e-3
 class NeuralLinearSelector(BayesianSelector):
     """Thompson sampling on the hidden layer of a network that predicts every policy's reward from the whitened context.
 
+    It seldom stays with a worse policy (1 of 80 seeds of four problems without context, `benchmarks/selection.py`), as it chooses by chance.
+
     The network is trained from scratch whenever the features are fitted, on all decisions so far; it sees the reward of the chosen policy only.
 
     Args:
