@@ -549,8 +549,14 @@ def test_the_listing_has_its_tasks(execute):
     assert "pick_place" in [task["name"] for task in found["tasks"]]
 
 
-def test_demonstrations_of_another_suite_are_refused(execute):
-    assert "'toy:reach' is of the suite 'toy'" in execute("collect", "--task", "toy:reach", "--episodes", 1, "--out", "x", code=2)
+@pytest.mark.slow
+def test_demonstrations_of_another_suites_expert(execute):
+    flags = ["--task", "toy:reach", "--episodes", 2, "--workers", 1, "--image-size", 32, "--out", "demonstrations"]
+    assert "unknown camera 'wrist': known: top" in execute("collect", *flags, "--camera", "wrist", code=2)
+    assert "2 demonstrations" in execute("collect", *flags)
+    side = json.loads((execute.home / "demonstrations" / "meta" / "osel_sim.json").read_text())
+    assert side["task"] == "toy:reach" and side["seeds"] == 2 and side["failed_seeds"] == []
+    assert "is complete" in execute("collect", *flags, "--resume")
 
 
 @pytest.mark.slow

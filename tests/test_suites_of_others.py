@@ -90,6 +90,13 @@ def test_any_gymnasium_environment_that_says_success_is_a_task():
     env.close()
 
 
+def test_demonstrations_need_an_expert(tmp_path):
+    with pytest.raises(UsageError, match="has no scripted expert, so there is nobody to demonstrate it"):
+        osel_sim.collect(task="gym:osel_test/Right-v0", episodes=1, out=tmp_path / "data")
+    with pytest.raises(UsageError, match="camera: is for other suites"):
+        osel_sim.collect(task="lift", camera="top", episodes=1, out=tmp_path / "data")
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
