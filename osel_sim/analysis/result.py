@@ -1,7 +1,7 @@
 """A replay from choices to `replay.json`: everything measured, and the tables."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,21 @@ def with_fixed(choices: Choices, best: Oracles) -> Choices:
     return Choices(choices.instances, choices.policies, choices.order, choices.repeats, {**choices.chosen, **singles, **fixed})
 
 
+@dataclass(frozen=True)
+class Question:
+    """What a verdict is asked.
+
+    Attributes:
+        margin: a gain in reward a decision below it is not worth routing for.
+        halved: whether selectors were shown the log's other half where they start warm.
+        route_with: selectors that the verdict may advise; None: those that we recommend (`osel_sim.analysis.verdict.advisable`).
+    """
+
+    margin: float = MARGIN
+    halved: bool = False
+    route_with: Sequence[str] | None = None
+
+
 def build(
     log: LoggedOutcomes,
     weights: RewardWeights,
@@ -37,9 +52,7 @@ def build(
     best: Oracles,
     left_out: LeftOut,
     seeds: Sequence[int],
-    margin: float = MARGIN,
-    halved: bool = False,
-    route_with: Sequence[str] | None = None,
+    question: Question = Question(),
 ) -> dict[str, Any]:
     """What `replay.json` holds. May be called at any moment, of the selectors that are there so far.
 
@@ -47,20 +60,17 @@ def build(
         log: the instances of `choices`, in its order.
         preset: name of the paper's weights, where they are that.
         choices: with the fixed policies (`with_fixed`).
-        margin: a gain in reward a decision below it is not worth routing for.
-        halved: whether selectors were shown the log's other half where they start warm.
-        route_with: selectors that the verdict may advise; None: those that we recommend (`osel_sim.analysis.verdict.advisable`).
+        question: of the verdict.
 
     Returns:
         log (folder, instances, left_out, policies, repeats, encoder, tasks), reward, seeds, decisions, selectors, oracles, learnable_oracle, paired,
         verdict, and frontier, which is None until it is replayed (`osel_sim.analysis.frontier`). Each selector has a `kind`: `learner`, `random` or
         `fixed` (with its `policy`).
     """
-    rewards = curves(log, weights, choices, best, margin)
+    rewards = curves(log, weights, choices, best, question.margin)
     policies = choices.policies
     singles = {BEST: policies[best.best_single], WORST: policies[best.worst_single]}
     selectors = _selectors(log, weights, choices, rewards, singles)
-    always = {BEST: {key: selectors[BEST][key] for key in ("mean_reward", "ci95")}}
     return {
         "log": {
             "folder": str(log.source),
@@ -77,17 +87,7 @@ def build(
         "decisions": int(choices.order.shape[1]),
         "late_from": rewards.late,
         "selectors": selectors,
-        "oracles": {
-            name: {
-                "mean_reward": float(values.mean()),
-                "ci95": difference_ends(rewards, name, values),
-                "mean_reward_late": float(values[:, rewards.late :].mean()),
-                "gain": rewards.gains[name].mean,
-                "gain_ci95": rewards.gains[name].ends,
-            }
-            | always.get(name, {})
-            for name, values in rewards.oracles.items()
-        },
+        "oracles": _oracles(rewards, selectors[BEST]),
         "learnable_oracle": {
             "name": rewards.learnable,
             "repeated": int(np.isfinite(best.expected_gains).sum()),
@@ -95,8 +95,24 @@ def build(
             "beaten": dict(rewards.beaten),
         },
         "paired": paired(rewards, [*_of_kind(selectors, "learner"), *_of_kind(selectors, "random"), BEST]),
-        "verdict": _verdict(log, weights, choices, best, rewards, selectors, halved, route_with),
+        "verdict": _verdict(log, weights, choices, best, rewards, selectors, question),
         "frontier": None,
+    }
+
+
+def _oracles(rewards: Curves, best: Mapping[str, Any]) -> dict[str, Any]:
+    """What each oracle comes to; the best single policy is one of them, with the figures that it has as a selector."""
+    always = {BEST: {key: best[key] for key in ("mean_reward", "ci95")}}
+    return {
+        name: {
+            "mean_reward": float(values.mean()),
+            "ci95": difference_ends(rewards, name, values),
+            "mean_reward_late": float(values[:, rewards.late :].mean()),
+            "gain": rewards.gains[name].mean,
+            "gain_ci95": rewards.gains[name].ends,
+        }
+        | always.get(name, {})
+        for name, values in rewards.oracles.items()
     }
 
 
@@ -121,11 +137,10 @@ def _verdict(
     best: Oracles,
     rewards: Curves,
     selectors: Mapping[str, Mapping[str, Any]],
-    halved: bool,
-    route_with: Sequence[str] | None,
+    question: Question,
 ) -> dict[str, Any]:
     """The verdict, its words, and what the learnable oracle gains."""
-    tested, error = advisable(_of_kind(selectors, "learner"), halved, route_with)
+    tested, error = advisable(_of_kind(selectors, "learner"), question.halved, question.route_with)
     found = verdict(played(log, weights, choices, best), tested, rewards.margin, error)
     stake = found["stake"] or {}
     one, other = selectors.get(stake.get("selector", "")), selectors[f"fixed:{found['policy']}"]

@@ -20,8 +20,11 @@ if TYPE_CHECKING:
 
     from osel_sim.formats.rollout_log import Row
     from osel_sim.ingestion.columns import Columns
+    from osel_sim.ingestion.convert import Source
     from osel_sim.ingestion.paired import Paired
     from osel_sim.ingestion.records import Record
+    from osel_sim.ingestion.write import IngestedInstance
+    from osel_sim.interface.encoder import Image
     from osel_sim.selection.reward import RewardWeights
 
 logger = logging.getLogger(__name__)
@@ -191,12 +194,11 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
     from osel_sim.context.names import DEFAULT_ENCODER
     from osel_sim.context.text_encoders import TFIDF, text_encoders_at_hand
     from osel_sim.core.files import file_digest
-    from osel_sim.core.images import load_image
     from osel_sim.formats.rollout_log import PROPENSITIES
     from osel_sim.ingestion.convert import convert
     from osel_sim.ingestion.doubts import alike, beyond_reason
     from osel_sim.ingestion.readers import read_tables
-    from osel_sim.ingestion.write import IngestedInstance, check_out, name_encoder, write_log
+    from osel_sim.ingestion.write import check_out, name_encoder, write_log
     from osel_sim.selection.reward import RewardWeights
 
     start = time.perf_counter()
@@ -206,18 +208,7 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
         columns, found = _columns(config, out), None
         records = read_tables(columns)
     converted = convert(columns, records)
-    instances = []
-    for source in converted.sources:
-        for image in source.images:
-            load_image(image, source.record.where)  # a broken one is found before an hour of encoding, not after
-        instances.append(
-            IngestedInstance(
-                source.key,
-                source.text,
-                " ".join(file_digest(image) for image in source.images),
-                lambda source=source: [load_image(image, source.record.where) for image in source.images],  # type: ignore[misc]
-            )
-        )
+    instances = [_instance(source) for source in converted.sources]
     inputs = check_out(out, instances)
     keys = [(source.task, source.key.removeprefix(f"{source.task}/")) for source in converted.sources]
     doubts = [*alike("groups", ((task,) for task, _ in keys)), *(alike("instances", keys) if columns.key else ())]
@@ -249,6 +240,19 @@ def _table(config: IngestConfig, out: Path) -> IngestResult:
         name_encoder(out, identity)
         notes.append(str(choice))
     return _result(config, out, converted.rows, identity, start, tuple(notes))
+
+
+def _instance(source: "Source") -> "IngestedInstance":
+    """What is to be encoded of an instance, with its images looked at: a broken one is found before an hour of encoding, not after."""
+    from osel_sim.core.files import file_digest
+    from osel_sim.core.images import load_image
+    from osel_sim.ingestion.write import IngestedInstance
+
+    def images() -> "list[Image]":
+        return [load_image(image, source.record.where) for image in source.images]
+
+    images()
+    return IngestedInstance(source.key, source.text, " ".join(file_digest(image) for image in source.images), images)
 
 
 def _action_mse(config: IngestConfig, out: Path) -> IngestResult:

@@ -171,7 +171,7 @@ class _Replay:
         """Replay stage by stage: what a verdict needs, all other selectors, and again at other weights. Each is written and told."""
         from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
-        from osel_sim.analysis.result import build, tables, with_fixed
+        from osel_sim.analysis.result import Question, build, tables, with_fixed
         from osel_sim.core.progress import progress
         from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
 
@@ -180,7 +180,7 @@ class _Replay:
             log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
-        here = setup(weights)
+        here, question = setup(weights), Question(config.margin, config.half is not None, config.route_with)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
         parts = [*stages, *([] if plan is None else [plan.part])]
@@ -201,7 +201,7 @@ class _Replay:
                     known = {name: chosen[name] for name in selectors if name in chosen}
                     best = bounds.result()
                     choices = with_fixed(replace(made[0], chosen=known), best)
-                    result = build(log, weights, preset, choices, best, left_out, seeds, config.margin, config.half is not None, config.route_with)
+                    result = build(log, weights, preset, choices, best, left_out, seeds, question)
                     result["log"] |= {"half": config.half, "context": config.context}
                     result["log"]["encoder_choice"] = None if choice is None else {"text": str(choice), **asdict(choice)}
                     result["off_policy"] = off_policy

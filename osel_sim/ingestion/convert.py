@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -112,16 +112,20 @@ def convert(columns: Columns, records: Sequence[Record]) -> Converted:
             outcomes[place] = row, record
             if columns.propensity is not None:
                 propensities[place] = _propensity(record, columns.propensity)
-    ran = {policy for _, policy, _ in outcomes}
-    for name in names:
-        if name not in ran:
-            raise DataError(f"{records[0].file}: policy {quoted(name)} has no outcome in any row")
+    _check_all_ran(names, {policy for _, policy, _ in outcomes}, records[0].file)
     order = {key: index for index, key in enumerate(sources)}, {name: index for index, name in enumerate(names)}
     places = sorted(outcomes, key=lambda place: (order[0][place[0]], order[1][place[1]], place[2]))
     with_outcome = {place[0] for place in places}
     used = [source for key, source in sources.items() if key in with_outcome]
     chances = None if columns.propensity is None else [propensities[place] for place in places]
     return Converted([outcomes[place][0] for place in places], used, list(names), dropped, differing, chances)
+
+
+def _check_all_ran(names: Iterable[str], ran: Set[str], file: Path) -> None:
+    """Refuse a policy without any outcome."""
+    for name in names:
+        if name not in ran:
+            raise DataError(f"{file}: policy {quoted(name)} has no outcome in any row")
 
 
 def _source(

@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from osel_sim.core.errors import UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_json
 from osel_sim.formats.rollout_log import ROLLOUTS, Row, read_rollouts, write_rollouts
 from osel_sim.interface.encoder import Encoder, Image, TextEncoder
+
+if TYPE_CHECKING:
+    from osel_sim.context.cache import ContextCache
 
 BATCH = 32
 """Texts that are encoded at once."""
@@ -96,14 +99,7 @@ def write_log(
             for batch in _batches(instances, encoder):
                 if missing.isdisjoint(item.key for item in batch):
                     continue
-                if isinstance(encoder, TextEncoder):
-                    texts = list(dict.fromkeys(item.text for item in batch))
-                    contexts = dict(zip(texts, encoder.encode_texts(texts), strict=True))
-                    for item in batch:
-                        cache.put(encoder.identity, item.key, contexts[item.text])
-                else:
-                    for item in batch:
-                        cache.encode(encoder, item.key, item.images, item.text)
+                _encode(batch, encoder, cache)
                 bar.update(len(missing.intersection(item.key for item in batch)))
         identity = encoder.identity
         if appended is not None:
@@ -117,6 +113,18 @@ def write_log(
     if not there:
         write_rollouts(folder, rows, {**metadata, "encoder": identity})
     return identity
+
+
+def _encode(batch: Sequence[IngestedInstance], encoder: Encoder, cache: "ContextCache") -> None:
+    """Put the contexts of a batch into the cache."""
+    if isinstance(encoder, TextEncoder):
+        texts = list(dict.fromkeys(item.text for item in batch))
+        contexts = dict(zip(texts, encoder.encode_texts(texts), strict=True))
+        for item in batch:
+            cache.put(encoder.identity, item.key, contexts[item.text])
+    else:
+        for item in batch:
+            cache.encode(encoder, item.key, item.images, item.text)
 
 
 def name_encoder(folder: Path, identity: str) -> None:
