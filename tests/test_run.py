@@ -134,8 +134,8 @@ def test_a_journal_begun_without_scenes_goes_on_without(world, reference):
         return "".join(to_line({key: value for key, value in json.loads(line).items() if key != "scene"}) for line in lines).encode()
 
     lines = (folder / "episodes.jsonl").read_text().splitlines()
-    for name in ("timing.jsonl", "counterfactual.jsonl"):
-        (folder / name).write_text("".join((folder / name).read_text().splitlines(keepends=True)[:3]))
+    (folder / "timing.jsonl").unlink()  # such a version kept no checksums there either
+    (folder / "counterfactual.jsonl").write_text("".join((folder / "counterfactual.jsonl").read_text().splitlines(keepends=True)[:3]))
     (folder / "episodes.jsonl").write_bytes(without(lines[:3]))
     (folder / "summary.json").unlink()
     done = execute(world, "run", "--episodes", EPISODES, "--counterfactual", "--out", folder, "--resume", "--no-page")

@@ -14,7 +14,7 @@ from osel_sim.reporting.charts import Figure, Look, Panel, listed
 from osel_sim.reporting.palette import colours
 from osel_sim.selection.reward import RewardWeights
 
-_MOST_ROWS = 12
+_MOST_ROWS = 10
 """Groups on the first screen; the figure of the policies has them all."""
 
 WORDS = {"task": "task", "robot": "robot", "target": "object asked for"}
@@ -139,7 +139,7 @@ def _rewards(results: Sequence[PolicyResult]) -> list[Cell]:
             cells.append(Cell(result.group, result.policy, 0.0, "–", "no outcome"))
             continue
         reward = result.reward
-        text = f"{reward.value:.3f}".replace("-", "\u2212")
+        text = f"{round(reward.value, 3) + 0.0:.3f}".replace("-", "\u2212")  # no negative zero
         cells.append(
             Cell(result.group, result.policy, (reward.value - low) / span, text, f"{reward.value:.3f} [{reward.low:.3f}, {reward.high:.3f}]")
         )
