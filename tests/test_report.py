@@ -270,7 +270,10 @@ def test_the_same_input_is_the_same_bytes(all_pages, page_of_log, tmp_path):
 
 def test_wrong_folders_and_flags(tmp_path, capsys):
     assert report_main([str(tmp_path)]) == 2
-    assert "holds neither episodes.jsonl (a live run), replay.json (a replay) nor rollouts.parquet" in capsys.readouterr().err
+    assert (
+        "holds neither episodes.jsonl (a live run), replay.json (a replay), compare.json (a comparison) nor rollouts.parquet"
+        in capsys.readouterr().err
+    )
     folder = made_run(tmp_path / "run", decisions=3)
     assert report_main([str(folder), "--alpha-time", "1"]) == 2
     assert "--alpha-time" in capsys.readouterr().err

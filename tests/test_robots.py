@@ -164,7 +164,7 @@ def test_gymnasium_makes_a_task_with_a_robot():
     made = gymnasium.make("osel_sim.envs:osel_sim/lift-v0", robot="UR5e").unwrapped
     observation, info = made.reset(seed=0)
     assert made.world.robot.name == "UR5e" and info["instance"].endswith("-UR5e")
-    assert observation["observation.state"].shape == (8,)
+    assert observation["state"].shape == (8,)
     made.close()
 
 

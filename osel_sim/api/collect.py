@@ -66,7 +66,7 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
     from osel_sim.core.holding import held
     from osel_sim.formats.levels import parse_axes, resolve
     from osel_sim.formats.run_config import robots_said
-    from osel_sim.interface.suite import OURS
+    from osel_sim.interface.instance import OURS
     from osel_sim.suites.registry import known_axes, select_task_files, select_tasks
     from osel_sim.training import collection
 

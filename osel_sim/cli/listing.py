@@ -14,8 +14,8 @@ from osel_sim.core.errors import OselError
 from osel_sim.core.shown import all_shown
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
 from osel_sim.formats.task_file import TaskSpec, load_task_file
+from osel_sim.interface.instance import OURS
 from osel_sim.interface.robot import DEFAULT_ROBOT
-from osel_sim.interface.suite import OURS
 from osel_sim.selection import registry as selectors
 from osel_sim.selection.weights import PRESETS
 from osel_sim.sim.robots import ROBOTS
@@ -118,15 +118,17 @@ def _task(task: TaskSpec) -> dict[str, Any]:
 
 def _suite(name: str) -> dict[str, Any]:
     """A suite of others; one that cannot be loaded says why, and keeps nobody from the rest of the listing."""
-    from osel_sim.interface.suite import Task  # imports numpy
-    from osel_sim.suites.registry import load_suite
-
     try:
+        from osel_sim.interface.suite import Task  # imports numpy
+        from osel_sim.suites.registry import load_suite
+
         suite = load_suite(name)
         tasks = [
             {"name": Task(suite, short).name, "title": info.title, "tags": list(info.tags), "horizon": info.horizon}
             for short, info in suite.tasks.items()
         ]
+    except ModuleNotFoundError as missing:  # a Python without our packages lists what files say
+        return {"name": name, "title": "", "tasks": [], "problem": f"needs the package {missing.name!r}, which this Python does not have"}
     except OselError as error:
         return {"name": name, "title": "", "tasks": [], "problem": str(error)}
     return {"name": name, "title": suite.spec.title, "tasks": tasks, "problem": None}

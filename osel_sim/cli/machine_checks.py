@@ -194,7 +194,7 @@ def _tasks(folder: Path | None) -> Iterator[Check]:
 def _suites() -> Iterator[Check]:
     """Suites of others; nothing of ours needs one."""
     from osel_sim.cli.suites_command import state_words, suite_state
-    from osel_sim.interface.suite import OURS
+    from osel_sim.interface.instance import OURS
 
     for name in SUITES:
         if name == OURS:

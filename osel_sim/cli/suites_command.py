@@ -84,7 +84,7 @@ def state_words(state: dict[str, Any]) -> str:
 
 
 def _list(config: ListConfig) -> int:
-    from osel_sim.interface.suite import OURS
+    from osel_sim.interface.instance import OURS
     from osel_sim.suites import SUITES
 
     known = [name for name in SUITES if name != OURS]

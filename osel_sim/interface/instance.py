@@ -6,6 +6,8 @@ from typing import Protocol
 from osel_sim.interface.robot import DEFAULT_ROBOT
 
 SPLITS = ("train", "validation", "test")
+OURS = "osel_sim"
+"""The suite whose tasks need no prefix."""
 SUITE_SEPARATOR = ":"
 """Between the suite and the task, as in `metaworld:reach-v3`."""
 

@@ -9,10 +9,7 @@ from typing import Protocol, runtime_checkable
 
 from osel_sim.core.errors import MissingPackageError, UnknownNameError, UsageError
 from osel_sim.interface.environment import Environment, EnvironmentSpec
-from osel_sim.interface.instance import SPLITS, SUITE_SEPARATOR, Instance
-
-OURS = "osel_sim"
-"""The suite whose tasks need no prefix."""
+from osel_sim.interface.instance import OURS, SPLITS, SUITE_SEPARATOR, Instance
 
 
 @dataclass(frozen=True)

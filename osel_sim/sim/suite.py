@@ -9,9 +9,9 @@ from osel_sim.core.files import digest
 from osel_sim.formats.levels import AXES, LEVELS
 from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.environment import EnvironmentSpec
-from osel_sim.interface.instance import SPLITS
+from osel_sim.interface.instance import OURS, SPLITS
 from osel_sim.interface.specification import specification
-from osel_sim.interface.suite import OURS, SuiteSpec, TaskInfo
+from osel_sim.interface.suite import SuiteSpec, TaskInfo
 from osel_sim.sim.robots import load_robot, with_robot
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from pathlib import Path
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.environment import EnvironmentSpec
-from osel_sim.interface.instance import SUITE_SEPARATOR
-from osel_sim.interface.suite import OURS, Suite, TakesFolder, Task
+from osel_sim.interface.instance import OURS, SUITE_SEPARATOR
+from osel_sim.interface.suite import Suite, TakesFolder, Task
 from osel_sim.suites import SUITES
 
 ALL, TAG = "all", "tag"

@@ -12,7 +12,7 @@ from vla_eval.render import configure_mujoco_render
 from vla_eval.specs import GRIPPER_CLOSE_POS, IMAGE_RGB, LANGUAGE, POSITION_DELTA, RAW, ROTATION_AA, STATE_EEF_POS_AA_GRIP
 
 from osel_sim.core.errors import UnknownNameError, UsageError
-from osel_sim.interface.suite import OURS
+from osel_sim.interface.instance import OURS
 from osel_sim.suites.open_tasks import OpenTasks
 from osel_sim.suites.registry import common_specification, select_tasks
 
