@@ -387,8 +387,8 @@ def test_what_goes_where(log, tmp_path):
     many = made_table(tmp_path, 30)
     figure = route_figure(many, WEIGHTS)
     names = list(dict.fromkeys(cell["row"] for cell in records(figure.spec, figure.spec["concat"][0])))
-    assert names[0] == "all" and set(names[1:3]) == {"subject_28", "subject_29"} and len(names) == 11  # the first screen, what matters first
-    assert "10 of 30" in figure.caption
+    assert names[0] == "all" and set(names[1:3]) == {"subject_28", "subject_29"} and len(names) == 12  # the first screen, what matters first
+    assert "11 of 30" in figure.caption
 
 
 def test_dots_that_coincide_are_told_apart():

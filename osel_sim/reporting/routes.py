@@ -14,7 +14,7 @@ from osel_sim.reporting.charts import Figure, Look, Panel, listed
 from osel_sim.reporting.palette import colours
 from osel_sim.selection.reward import RewardWeights
 
-_MOST_ROWS = 10
+_MOST_ROWS = 11
 """Groups on the first screen; the figure of the policies has them all."""
 
 WORDS = {"task": "task", "robot": "robot", "target": "object asked for"}
