@@ -150,7 +150,14 @@ def serving_with(handler: Callable[[ServerConnection], None], greeting: bytes | 
         connection.send(pack(GREETING.to_dict()) if greeting is None else greeting)
         handler(connection)
 
-    with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
+    with waiting(handle) as url:
+        yield url
+
+
+@contextlib.contextmanager
+def waiting(handler: Callable[[ServerConnection], None]) -> Iterator[str]:
+    """A WebSocket server that does not greet."""
+    with serve(handler, "127.0.0.1", 0, compression=None, max_size=None) as server:
         thread = threading.Thread(target=server.serve_forever)
         thread.start()
         try:

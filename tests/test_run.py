@@ -171,6 +171,11 @@ def test_a_warm_start_shows_the_outcomes_of_other_instances_first(world, capsys)
     assert costs["wild"] > costs["calm"] and before["settings"]["skills"] is None  # they declare none
     assert user(world, *flags, "--warm-start", log, "--resume") == 0
     np.testing.assert_equal(load_state(out / "selector.safetensors"), before)
+    capsys.readouterr()
+    # It cannot go on to instances whose outcomes it was shown.
+    assert run_main(["--out", str(out), "--resume", "--episodes", "5", "--no-page"]) == 2
+    assert f"--episodes 5: 1 of the instances to come, such as short/test/0/4, are in {log}" in capsys.readouterr().err
+    assert len(read_journal(out / "episodes.jsonl")) == 4 and json.loads((out / "run.json").read_text())["configuration"]["episodes"] == 4
 
 
 def test_ctrl_c_ends_with_what_there_is(world):

@@ -3,12 +3,10 @@
 The slow tests try both against its own package.
 """
 
-import contextlib
 import json
 import sys
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +14,8 @@ import msgpack
 import numpy as np
 import pytest
 from other_packages import beside
-from remote_helpers import ENVIRONMENT, TOKEN, observation, serving, serving_with
-from websockets.sync.server import ServerConnection, serve
+from remote_helpers import ENVIRONMENT, TOKEN, observation, serving, serving_with, waiting
+from websockets.sync.server import ServerConnection
 
 import osel_sim as osel
 from osel_sim.core.errors import ContentError, RemoteError
@@ -77,19 +75,6 @@ def ask(handler: Any, mapping: Conventions | None = None, **settings: Any) -> An
     with waiting(handler) as url, VlaEvalClient(url, ENVIRONMENT, timeout=2, mapping=mapping, **settings) as client:
         client.reset("pick up the can")
         return client.act(observation())
-
-
-@contextlib.contextmanager
-def waiting(handler: Any) -> Iterator[str]:
-    """As `serving_with`, without a greeting."""
-    with serve(handler, "127.0.0.1", 0, compression=None, max_size=None) as server:
-        thread = threading.Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
-        finally:
-            server.shutdown()
-            thread.join(10)
 
 
 def test_an_observation_goes_over_in_their_words_and_actions_come_back() -> None:

@@ -23,7 +23,7 @@ from osel_sim.api.settings import (
     RewardSettings,
     settings,
 )
-from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.core.errors import UnknownNameError
 from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
@@ -135,7 +135,9 @@ def run(
         factory = None if isinstance(selector, str) else selector
     config = RunConfig.of(**values) if config is None else config.changed(**values)
     if config.resume and not config.task and config.out is not None:
-        config = _as_begun(config, config.out)
+        from osel_sim.api.run_resume import settings_then
+
+        config = config.of(**settings_then(config.out) | {name: getattr(config, name) for name in config.given})
     with trusting(config.trust):
         return _Run(config, objects, factory, subscribers).execute()
 
@@ -177,19 +179,20 @@ class _Run:
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
         self.axes_above = sorted({instance.axes for instance in drawn if instance.axes})
         self.page = self._page()
+        self.grown_from: int | None = None  # decisions that a resumed run was to have, where those are fewer
 
     def execute(self) -> RunResult:
         """Do it."""
+        from osel_sim.api.run_resume import episodes_then
         from osel_sim.core.holding import held
         from osel_sim.formats.run_config import check_run_folder
         from osel_sim.remote.policy import check_servers
 
         config, folder = self.config, self.config.folder
         configuration = self._configuration()
-        # Decisions do not depend on how many follow.
-        self.grown = config.resume and (began := _episodes_of(folder)) is not None and began < config.episodes
-        if self.grown:
-            configuration["episodes"] = began
+        then = episodes_then(folder) if config.resume else None
+        if then is not None and then < config.episodes:  # decisions do not depend on how many follow
+            self.grown_from, configuration["episodes"] = then, then
         check_run_folder(folder, configuration, config.resume)
         check_servers(self.everyone, self.environment)
         with contextlib.ExitStack() as holding:
@@ -230,7 +233,7 @@ class _Run:
             if seen is not None:
                 self._start_warm(live, seen)
             live.replay()
-            if self.grown:
+            if self.grown_from is not None:
                 note_growth(folder, config.episodes)
             with _Interrupt() as interrupt:
                 live.run(config.episodes, lambda: interrupt.asked)
@@ -333,13 +336,11 @@ class _Run:
     def _start_warm(self, live: "LiveRun", log: "LoggedOutcomes") -> None:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
         from osel_sim.analysis.warm_start import WarmStart, show
+        from osel_sim.api.run_resume import check_still_unseen
 
         own = live.instance_keys(self.config.episodes)
-        if self.grown and (shown := (own - live.instance_keys(_episodes_of(live.folder) or 0)).intersection(log.keys)):
-            raise UsageError(
-                f"--episodes {self.config.episodes}: {len(shown)} of the instances to come, such as {min(shown)}, are in {log.source}, "
-                "whose outcomes the selector was shown before the first decision; begin a new run"
-            )
+        if self.grown_from is not None:
+            check_still_unseen(own - live.instance_keys(self.grown_from), log.keys, log.source, self.config.episodes)
         log = log.take([row for row, key in enumerate(log.keys) if key not in own])
         count = show(live.selector, WarmStart(log.contexts, log.rewards(self.weights)), live.selector.policies, self.config.seed)
         logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
@@ -378,29 +379,6 @@ class _Interrupt:
         self.asked = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
         logger.info("\nfinishing this decision; Ctrl-C again leaves at once")
-
-
-def _as_begun(config: RunConfig, folder: Path) -> RunConfig:
-    """The settings that the run in a folder began with, and those that are given now.
-
-    Raises:
-        UsageError: there is no run to resume, or it does not say with which settings it began.
-    """
-    from osel_sim.formats.run_config import RUN, check_run_folder, read_run
-
-    check_run_folder(folder, {}, resume=True)
-    began = read_run(folder).get("settings")
-    if not isinstance(began, dict) or not began.get("task"):
-        raise UsageError(f"{folder / RUN} does not hold the settings that the run began with: give --task and the other flags again")
-    return RunConfig.of(**(began | {name: getattr(config, name) for name in config.given}))
-
-
-def _episodes_of(folder: Path) -> int | None:
-    """How many decisions the run in a folder is to have."""
-    from osel_sim.formats.run_config import RUN, read_run
-
-    episodes = read_run(folder)["configuration"].get("episodes") if (folder / RUN).is_file() else None
-    return episodes if type(episodes) is int else None
 
 
 def title(tasks: "Sequence[Task]") -> str:

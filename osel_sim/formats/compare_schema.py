@@ -151,28 +151,6 @@ class Comparison(_Part):
         return self
 
 
-class Plan(_Part):
-    """What a comparison of two policies takes."""
-
-    first: Name
-    second: Name
-    instances: Some
-    discordant: Share
-    detect: Share
-    power: Share
-    needed: Some
-    more: Count
-    margin: Share
-    needed_for_no_worse: Some | None
-
-
-class Planned(_Part):
-    """What `--plan` leaves."""
-
-    schema_version: int
-    plan: Annotated[list[Plan], MinLen(1)]
-
-
 def faults(error: Any) -> Iterator[str]:
     """What is wrong, place by place, of a pydantic error."""
     for detail in error.errors(include_url=False):

@@ -20,12 +20,11 @@ RENDERED = "render"
 HOLDS = ("zero", "state")
 
 
-@dataclass(frozen=True)
-class GymSettings:
+@dataclass(frozen=True, kw_only=True)
+class Unsaid:
     """What a gymnasium environment does not say of itself.
 
     Attributes:
-        name: of the environment, in messages and as the robot.
         control_hz: control steps a second; 0: as its metadata say (`render_fps`), else 20.
         horizon: control steps after which an episode ends; 0: as it is registered.
         actions: names of the components of an action; empty: a0, a1 ...
@@ -36,7 +35,6 @@ class GymSettings:
         reset: options for `reset`.
     """
 
-    name: str
     control_hz: float = 0.0
     horizon: int = 0
     actions: tuple[str, ...] = ()
@@ -45,6 +43,17 @@ class GymSettings:
     hold: str = "zero"
     state: tuple[str, ...] = ()
     reset: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class GymSettings(Unsaid):
+    """The same of an environment by name.
+
+    Attributes:
+        name: in messages, and as the robot.
+    """
+
+    name: str
 
 
 class GymEnvironment(BaseEnvironment):

@@ -7,7 +7,7 @@ LeRobotDataset that was not finalised cannot be read.
 import functools
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,8 @@ NOWHERE = 9.0
 """Column and row of a thing that an image does not show."""
 DONE = "done.json"
 """What a finished shard says of itself."""
+Demonstrate = Callable[[int], list[dict[str, Any]] | None]
+"""Frames of the demonstration of a seed, or None if the expert fails."""
 LENGTH_LIMIT = 1.6
 """A demonstration may take this many horizons: recovering takes time."""
 
@@ -94,30 +96,46 @@ def side_file(task: TaskSpec, levels: tuple[int, ...], axes: Mapping[str, int], 
 
 
 def record_shard(shard: Shard) -> tuple[int, int, list[int]]:
-    """Record one shard, unless it is there already. Runs in a worker process.
+    """Record one shard, unless it is there already. Runs in a worker process. Returns as `write_shard`."""
+
+    def begin() -> tuple[dict[str, Any], Demonstrate]:
+        from osel_sim.sim.instance import make_instance
+
+        env = _env(shard.task_file, shard.robot)
+        task = env.task
+
+        def demonstrate(seed: int) -> list[dict[str, Any]] | None:
+            env.load(make_instance(task, seed, shard.levels[seed % len(shard.levels)], "train", shard.axes))
+            return _demonstrate(env, shard.image_size, np.random.default_rng([seed, 1]))
+
+        about = {"fps": CONTROL_HZ, "features": features(task, shard.image_size), "robot_type": task.robot.lower()}
+        return {"repo_id": f"osel_sim/{task.name}", **about}, demonstrate
+
+    return write_shard(shard.folder, range(shard.first_seed, shard.first_seed + shard.episodes), begin)
+
+
+def write_shard(folder: Path, seeds: range, begin: Callable[[], tuple[dict[str, Any], Demonstrate]]) -> tuple[int, int, list[int]]:
+    """Write the demonstrations of some seeds as a LeRobotDataset, unless it is there already.
+
+    Args:
+        begin: called where it is not; gives what the dataset is (arguments of `LeRobotDataset.create`), and who demonstrates a seed.
 
     Returns:
         Frames recorded, episodes recorded, and the seeds the expert failed on (those are left out).
     """
-    done = shard.folder / DONE
+    done = folder / DONE
     if done.is_file():
         report = read_json(done)
         return report["frames"], report["episodes"], report["failed"]
-    shutil.rmtree(shard.folder, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
 
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from osel_sim.sim.instance import make_instance
-
-    env = _env(shard.task_file, shard.robot)
-    task = env.task
-    dataset = LeRobotDataset.create(
-        f"osel_sim/{task.name}", CONTROL_HZ, features(task, shard.image_size), root=shard.folder, robot_type=task.robot.lower(), use_videos=False
-    )
+    about, demonstrate = begin()
+    dataset = LeRobotDataset.create(**about, root=folder, use_videos=False)
     frames, episodes, failed = 0, 0, []
-    for seed in range(shard.first_seed, shard.first_seed + shard.episodes):
-        env.load(make_instance(task, seed, shard.levels[seed % len(shard.levels)], "train", shard.axes))
-        rows = _demonstrate(env, shard.image_size, np.random.default_rng([seed, 1]))
+    for seed in seeds:
+        rows = demonstrate(seed)
         if rows is None:
             failed.append(seed)
             continue

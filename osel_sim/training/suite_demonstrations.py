@@ -1,7 +1,5 @@
 """Demonstrations of the scripted experts of other suites, as LeRobotDatasets: those of `osel_sim.training.demonstrations` without labels."""
 
-import json
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from osel_sim.core.errors import UsageError
-from osel_sim.core.files import read_json, write_text
 from osel_sim.interface.environment import Environment, EnvironmentSpec, HasExpert
 from osel_sim.interface.suite import Task
-from osel_sim.training.demonstrations import BURST_PROBABILITY, BURST_STEPS, DONE
+from osel_sim.training.demonstrations import BURST_PROBABILITY, BURST_STEPS, Demonstrate, write_shard
 
 BURST = 0.9
 """Largest push of a burst, as a share of half the range of a motion."""
@@ -40,42 +37,19 @@ class SuiteShard:
         return self.folder.name
 
     def record(self) -> tuple[int, int, list[int]]:
-        """Record it, unless it is there already. Runs in a worker process.
+        """Record it, unless it is there already. Runs in a worker process. Returns as `write_shard`."""
+        return write_shard(self.folder, range(self.first_seed, self.first_seed + self.episodes), self._begin)
 
-        Returns:
-            Frames recorded, episodes recorded, and the seeds the expert failed on (those are left out).
-        """
-        if (self.folder / DONE).is_file():
-            report = read_json(self.folder / DONE)
-            return report["frames"], report["episodes"], report["failed"]
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
+    def _begin(self) -> tuple[dict[str, Any], Demonstrate]:
         env = _env(self.task)
         spec = env.specification
-        dataset = LeRobotDataset.create(
-            f"osel_sim/{self.task.name.replace(':', '_')}",
-            round(spec.control_hz),
-            features(spec, self.cameras, self.image_size),
-            root=self.folder,
-            robot_type=spec.robot.lower(),
-            use_videos=False,
-        )
-        frames, episodes, failed = 0, 0, []
-        for seed in range(self.first_seed, self.first_seed + self.episodes):
+
+        def demonstrate(seed: int) -> list[dict[str, Any]] | None:
             env.load(self.task.instance(seed, self.levels[seed % len(self.levels)], "train", self.axes))
-            rows = _demonstrate(env, self.cameras, self.image_size, np.random.default_rng([seed, 1]))
-            if rows is None:
-                failed.append(seed)
-                continue
-            for row in rows:
-                dataset.add_frame(row)
-            dataset.save_episode()
-            frames, episodes = frames + len(rows), episodes + 1
-        dataset.finalize()
-        write_text(self.folder / DONE, json.dumps({"frames": frames, "episodes": episodes, "failed": failed}))
-        return frames, episodes, failed
+            return _demonstrate(env, self.cameras, self.image_size, np.random.default_rng([seed, 1]))
+
+        about = {"fps": round(spec.control_hz), "features": features(spec, self.cameras, self.image_size), "robot_type": spec.robot.lower()}
+        return {"repo_id": f"osel_sim/{self.task.name.replace(':', '_')}", **about}, demonstrate
 
 
 def check_expert(task: Task, cameras: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,12 +1,13 @@
 """Environments as `gymnasium.make` gives them: here, or in the suite's host process."""
 
 import contextlib
+import dataclasses
 from typing import Any
 
 import osel_sim.suites.gym.tasks as files
 from osel_sim.core.errors import UsageError, nearest
 from osel_sim.interface.environment import Environment
-from osel_sim.suites.gymnasium_env import GymEnvironment, GymSettings, description
+from osel_sim.suites.gymnasium_env import GymEnvironment, GymSettings, Unsaid, description
 
 PLUGINS = ("gymnasium_robotics",)
 """Packages that register environments when they are imported."""
@@ -44,6 +45,5 @@ def _make(task: "files.GymTask") -> GymEnvironment:
         raise UsageError(f"gymnasium cannot make {task.id!r} ({str(error).strip()})" + (f"; did you mean {near[0]!r}?" if near else "")) from None
     except TypeError as error:
         raise UsageError(f"gymnasium cannot make {task.id!r} with render_mode 'rgb_array' ({error})") from None
-    said = ("control_hz", "horizon", "actions", "gripper", "gripper_convention", "hold", "state", "reset")
-    settings = GymSettings(f"gym:{task.id}", **{key: getattr(task, key) for key in said})
-    return GymEnvironment(env, settings)
+    unsaid = {field.name: getattr(task, field.name) for field in dataclasses.fields(Unsaid)}
+    return GymEnvironment(env, GymSettings(f"gym:{task.id}", **unsaid))

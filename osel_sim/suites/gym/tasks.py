@@ -9,21 +9,20 @@ from typing import Any
 
 from osel_sim.core.errors import ContentError, did_you_mean
 from osel_sim.interface.environment import GRIPPERS
-from osel_sim.suites.gymnasium_env import HOLDS
+from osel_sim.suites.gymnasium_env import HOLDS, Unsaid
 
 FOLDER = Path(__file__).resolve().parent / "files"
 
 
 @dataclass(frozen=True)
-class GymTask:
-    """One environment.
+class GymTask(Unsaid):
+    """One environment, and what it does not say of itself.
 
     Attributes:
         id: as `gymnasium.make` takes it, `module:Name-v0` for one that a module registers.
         title: one line about it.
         train, held_out: phrasings of the instruction; without any it is the words of the id.
         make: further arguments of `gymnasium.make`.
-        control_hz, horizon, actions, gripper, gripper_convention, hold, state, reset: as `GymSettings` has them.
     """
 
     id: str
@@ -31,15 +30,7 @@ class GymTask:
     train: tuple[str, ...] = ()
     held_out: tuple[str, ...] = ()
     tags: tuple[str, ...] = ()
-    control_hz: float = 0.0
-    horizon: int = 0
-    actions: tuple[str, ...] = ()
-    gripper: str | None = None
-    gripper_convention: str = "closed_positive"
-    hold: str = "zero"
-    state: tuple[str, ...] = ()
     make: Mapping[str, Any] = field(default_factory=dict)
-    reset: Mapping[str, Any] = field(default_factory=dict)
 
     def packed(self) -> str:
         """All of it as one text, for the host."""
