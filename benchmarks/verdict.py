@@ -1,15 +1,16 @@
 """How often the verdict of a replay is right, and how often its intervals hold the truth, on simulated logs of which all is known.
 
-    python benchmarks/verdict.py [--logs 250] [--slow 20] [--instances 600] [--seeds 20]
+    python benchmarks/verdict.py [--parts coverage stand-in auto] [--logs 500] [--instances 600] [--seeds 20]
 
 A simulated log: eight kinds of instances that contexts tell apart, policies that succeed at known rates on each. *gain g*: two equally good policies,
 each better on half of the kinds, so that a router that knows the kinds gains g; *useless*: rates are the same on all kinds; *equal*: and the
-same for both policies. Most logs are replayed to a quick stand-in (Thompson sampling on each kind, all seeds at once), `--slow` of some to `auto`.
-The last line is JSON.
+same for both policies. Most logs are replayed to a quick stand-in (Thompson sampling on each kind, all seeds at once), those of the
+part `auto` to `auto`. The last line is JSON.
 """
 
 import argparse
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from osel_sim.analysis.verdict import Played, verdict
 from osel_sim.core.progress import progress
 from osel_sim.statistics.clustered import unit_mean
 
+PARTS = ["coverage", "stand-in", "auto"]
 KINDS, DIM = 8, 16
 MARGIN = 0.02
 POPULATIONS = {
@@ -113,17 +115,14 @@ def coverage(name: str, logs: int, instances: int, seeds: int) -> dict[str, floa
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--logs", type=int, default=500, help="replayed to the stand-in, of each kind")
-    parser.add_argument("--slow", type=int, default=20, help="replayed to auto")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="intervals, verdicts of the stand-in, verdicts of auto")
+    parser.add_argument("--logs", type=int, default=500, help="of each kind")
     parser.add_argument("--instances", type=int, default=600)
     parser.add_argument("--seeds", type=int, default=20)
     options = parser.parse_args()
     size = options.instances, options.seeds
-    result = {
-        "coverage": {name: coverage(name, options.logs, *size) for name in POPULATIONS},
-        "verdicts": {name: decisions(name, options.logs, *size) for name in POPULATIONS},
-        "verdicts of auto": {name: decisions(name, options.slow, *size, slow=True) for name in POPULATIONS},
-    }
+    parts = {"coverage": coverage, "stand-in": decisions, "auto": partial(decisions, slow=True)}
+    result = {part: {name: parts[part](name, options.logs, *size) for name in POPULATIONS} for part in options.parts}
     for title, found in result.items():
         print(title)
         for name, shares in found.items():
