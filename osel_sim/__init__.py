@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from osel_sim.api.record import RecordConfig, record
     from osel_sim.api.replay import ReplayConfig, replay
     from osel_sim.api.report import ReportConfig, report
-    from osel_sim.api.run import RunConfig, run
+    from osel_sim.api.run import run
+    from osel_sim.api.run_settings import RunConfig
     from osel_sim.core.errors import OselError
     from osel_sim.policy.objects import as_policy
     from osel_sim.selection.base import SelectorBase
@@ -41,7 +42,7 @@ _PLACES = {
     "RecordConfig": "api.record",
     "ReplayConfig": "api.replay",
     "ReportConfig": "api.report",
-    "RunConfig": "api.run",
+    "RunConfig": "api.run_settings",
     "SelectorBase": "selection.base",
     "as_policy": "policy.objects",
     "collect": "api.collect",

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.api.run import RunConfig
+from osel_sim.api.run_settings import RunConfig
 from osel_sim.cli.command import INTERRUPTED, Command
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ import pytest
 from test_cli import commands_of
 
 from osel_sim.__main__ import COMMANDS
-from osel_sim.api.run import RunConfig
+from osel_sim.api.run_settings import RunConfig
 from osel_sim.cli.command import Command, read_settings
 from osel_sim.core import content
 from osel_sim.formats.dataset_mapping import load_dataset_mapping

@@ -1,0 +1,76 @@
+"""The settings of a live run."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from osel_sim.api.settings import (
+    MAIN,
+    OTHER,
+    OUTPUT,
+    ContentSettings,
+    Count,
+    Folder,
+    Index,
+    InstanceSettings,
+    Names,
+    RewardSettings,
+    settings,
+)
+
+FILMED_EVERY = 5
+"""Of a run that is viewed, one in so many decisions is filmed."""
+
+
+@settings
+class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
+    """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward."""
+
+    task: Annotated[Names, MAIN] = ()
+    """which tasks, mixed at random: names, tag:TAG, or all; of other suites SUITE:NAME"""
+    policies: Annotated[Names | None, MAIN] = None
+    """policies to choose from (default: all that fit the tasks)"""
+    selector: Annotated[str, MAIN] = "ppo"
+    """ppo, auto, epsilon_greedy, random, fixed:POLICY ..."""
+    episodes: Annotated[Count, MAIN] = 60
+    """number of decisions"""
+    encoder: Annotated[str | None, MAIN] = None
+    """osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder"""
+    context: Annotated[Literal["task"] | None, OTHER] = None
+    """append the task's name to the contexts; auto finds out whether it helps"""
+    seed: Annotated[Index, MAIN] = 0
+    """of instances and selector"""
+    out: Annotated[Path | None, MAIN] = None
+    """where to write (default: runs/TASK-SELECTOR-sSEED)"""
+    resume: Annotated[bool, MAIN] = False
+    """go on with the run in --out; alone with the settings that it began with, and with --episodes to more decisions than it was to have"""
+    counterfactual: Annotated[bool, MAIN] = False
+    """run the other policies as well, from the same state, to compare (nothing is learnt from them)"""
+    video: Annotated[Index, OUTPUT] = 0
+    """film so many decisions, spread evenly over the run"""
+    view: Annotated[bool, OUTPUT] = False
+    """show the run in the browser while it goes on: a page on this machine that grows every few decisions, with the last film"""
+    no_page: Annotated[bool, OUTPUT] = False
+    """do not write the page about it, which takes some seconds; python -m osel_sim.report does so later"""
+    tensorboard: Annotated[bool, OUTPUT] = False
+    """also write TensorBoard event files (needs the package tensorboard)"""
+    realtime: Annotated[bool, OTHER] = False
+    """sleep so that the robot moves in real time"""
+    warm_start: Annotated[Folder | None, OTHER] = None
+    """rollout log whose outcomes the selector is shown first (auto, linucb, thompson ...)"""
+
+    @property
+    def folder(self) -> Path:
+        """Where to write."""
+        tasks = "-".join(name.replace(":", "-").replace("/", "-") for name in self.task)
+        robot = f"-{self.robot}" if self.robot else ""
+        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}-s{self.seed}{robot}"
+
+    @property
+    def filmed(self) -> frozenset[int]:
+        """Indices of the decisions to film: the first, the last, and evenly between; with `view` every few, unless it is said how many."""
+        if self.view and not self.video:
+            return frozenset(range(0, self.episodes, FILMED_EVERY))
+        count = min(self.video, self.episodes)
+        if count == 1:
+            return frozenset({0})
+        return frozenset(round(number * (self.episodes - 1) / (count - 1)) for number in range(count))
