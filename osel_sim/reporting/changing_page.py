@@ -41,9 +41,8 @@ def changing_page(folder: Path, result: Mapping[str, Any], log: LoggedOutcomes, 
     facts += [("seeds", str(len(result["seeds"]))), ("decisions a seed", f"{result['decisions']:,}"), ("preset", str(result["reward"].get("preset")))]
     words = result["verdict"]
     verdict = Verdict(words["headline"], words["sentences"], _tiles(result))
-    return Page(
-        "Replay of changing streams", title, verdict, [Section("changes", "What changed", blocks), *shared], [*facts, *log_facts(log, weights)]
-    )
+    sections = [Section("changes", "What changed", blocks), *shared]
+    return Page("Replay of changing streams", title, verdict, sections, [*facts, *log_facts(log, weights)])
 
 
 def reward_figure(result: Mapping[str, Any]) -> Figure:
@@ -56,7 +55,7 @@ def reward_figure(result: Mapping[str, Any]) -> Figure:
         panels.append(curves(name, np.array(own["decision"]) + 1, lines, LOOK, ("decision", f"reward, last {found['lately']} decisions")))
     caption = (
         f"Mean reward of the last {found['lately']} decisions (since the change, where those are fewer), over all seeds. Changes: {_told(found)}. "
-        "Begun afresh: the same selector, new at the change. One that knew: it had the policies and prices of after the change from the first decision."
+        "Begun afresh: the same selector, new at the change. One that knew: it had what is there after the change from the first decision."
     )
     ends = [f"{name} {entry['spans'][-1]['whole']['mean_reward']:.3f}" for name, entry in found["selectors"].items() if entry["spans"]]
     return Figure("changing_reward", "Reward while things change", caption, f"Curves. After the last change: {listed(ends)}.", panels)
@@ -122,12 +121,8 @@ def _span_table(found: Mapping[str, Any], index: int) -> Table:
     for name, entry in found["selectors"].items():
         own = entry["spans"][index]
         soon, through = own["soon"], own["ways"]["through"]
-        row: dict[str, Cell] = {
-            "selector": name,
-            "reward": soon["mean_reward"],
-            "knew": soon["mean_reward_knew"],
-            "afresh": soon["mean_reward_afresh"],
-        }
+        row: dict[str, Cell] = {"selector": name, "reward": soon["mean_reward"]}
+        row |= {way: soon[f"mean_reward_{way}"] for way in ("knew", "afresh")}
         row |= {"against_knew": _estimate(soon["against_knew"]), "against_afresh": _estimate(soon["against_afresh"])}
         row |= {"lost": -own["whole"]["against_knew"]["sum"], "regret": -soon["against_oracle"]["mean"]}
         rows.append(row | {"success": through["success_rate"], "price": through["mean_price"]})
@@ -139,8 +134,8 @@ def _span_table(found: Mapping[str, Any], index: int) -> Table:
     ]
     best, there = span["best_single"], ", ".join(span["policies"])
     caption = (
-        f"Decisions {span['from']:,} to {span['to'] - 1:,}, with {there}. Soon after: the first {found['window']} of them at most, reward a decision, "
-        f"with 95% intervals over instances. Lost in all: a stream, up to the next change. The best single policy there is {best['policy']} "
+        f"Decisions {span['from']:,} to {span['to'] - 1:,}, with {there}. Soon after: the first {found['window']} of them at most, reward a "
+        f"decision, with 95% intervals over instances. Lost in all: a stream, up to the next change. The best single policy is {best['policy']} "
         f"({best['mean_reward']:.3f}); the oracle, a router trained on the outcomes of other instances as they are after the change, receives "
         f"{span['oracle']:.3f}. Success and cents are those of all these decisions."
     )
@@ -162,8 +157,9 @@ def _newcomers(found: Mapping[str, Any]) -> Table:
         *(Column("afresh", "of one begun afresh", digits=0), Column("knew", "of one that knew", digits=0)),
     ]
     caption = (
-        f"The fair share is {found['fair']:g} of what the newcomer has in the last quarter, up to the next change, under the selector that knew. It has "
-        f"it when its share of the last {found['lately']} decisions, over all seeds, is that much; a dash where that does not happen."
+        f"The fair share is {found['fair']:g} of what the newcomer has in the last quarter, up to the next change, under the selector that knew. "
+        f"It has it once {found['lately']} decisions in a row, over all seeds, give it that much; counted are the decisions before these. A dash "
+        "where that does not happen."
     )
     return Table("newcomers", "Decisions until a newcomer has its fair share", caption, columns, rows)
 
