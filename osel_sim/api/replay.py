@@ -63,6 +63,10 @@ class ReplayConfig(LoggedRewardSettings):
     """a gain in reward a decision that is not worth routing for"""
     route_with: Annotated[Names | None, OTHER] = None
     """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
+    budget_cents: Annotated[NonNegative | None, OTHER] = None
+    """replay within budgets, too: this one in cents, and quarters to four times of it, against the best that could be had for as much"""
+    budget_per: Annotated[Count | None, OTHER] = None
+    """with --budget-cents: a budget for each so many decisions, one after the other (default: one for the whole stream)"""
     encoder: Annotated[str | None, OTHER] = None
     """whose contexts, where the log has several, or auto: those that predict rewards best, by the choosing half (default: the one it was recorded
     with)"""
@@ -172,6 +176,7 @@ class _Replay:
         from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import Question, build, tables, with_fixed
+        from osel_sim.api.replay_budgets import plan_budgets_of
         from osel_sim.core.progress import progress
         from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
 
@@ -183,7 +188,8 @@ class _Replay:
         here, question = setup(weights), Question(config.margin, config.half is not None, config.route_with)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
-        parts = [*stages, *([] if plan is None else [plan.part])]
+        budgets = plan_budgets_of(config, log, here, selectors)
+        parts = [*stages, *([] if budgets is None else [budgets.part]), *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
         with (
             progress(sum(part.total for part in parts), "decision", scale=True) as bar,
@@ -196,6 +202,8 @@ class _Replay:
             for part, made in zip(parts, replayed, strict=True):
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
+                elif budgets is not None and part is budgets.part:
+                    result["budget"] = budgets.measured(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}

@@ -16,6 +16,7 @@ from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.episodes.budget_file import BudgetFile
     from osel_sim.episodes.live import LiveRun
     from osel_sim.episodes.run_subscribers import RunSubscriber
     from osel_sim.formats.policy_file import PolicySpec
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from osel_sim.interface.suite import Task
     from osel_sim.policy.objects import PolicyObject
     from osel_sim.reporting.live_page import LivePage
+    from osel_sim.selection.budget import Budgeted
     from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | SelectorFactory
@@ -89,6 +91,7 @@ class _Run:
         watchers: "Sequence[RunSubscriber]",
     ) -> None:
         from osel_sim.api.reward import weights_of
+        from osel_sim.api.run_budget import budget_of
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
@@ -104,11 +107,14 @@ class _Run:
         self.everyone = with_fallbacks(self.policies, config.policies_dir)
         self.weights = weights_of(config)[0]
         self._check_selector()
+        self.budget = budget_of(config, self.tasks, self.policies, self.everyone)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
         self.axes_above = sorted({instance.axes for instance in drawn if instance.axes})
         self.page = self._page()
+        self.spending: Budgeted | None = None
+        self.spent: BudgetFile | None = None
         self.grown_from: int | None = None  # decisions that a resumed run was to have, where those are fewer
 
     def execute(self) -> RunResult:
@@ -166,7 +172,7 @@ class _Run:
             if self.grown_from is not None:
                 note_growth(folder, config.episodes)
             with _Interrupt() as interrupt:
-                live.run(config.episodes, lambda: interrupt.asked)
+                live.run(config.episodes, lambda: interrupt.asked or (self.spending is not None and not self.spending.affordable))
             interrupted = interrupt.asked and len(live.decisions) < config.episodes
         return self._finish(live, interrupted)
 
@@ -189,6 +195,7 @@ class _Run:
 
     def _configuration(self) -> dict[str, Any]:
         """Everything the journal depends on but the encoder, content of files included."""
+        from osel_sim.api.run_budget import said
         from osel_sim.core.files import digest
         from osel_sim.formats.rollout_log import ROLLOUTS
         from osel_sim.formats.run_config import content_digests, robots_said
@@ -209,10 +216,22 @@ class _Run:
             "reward": asdict(self.weights),
             "counterfactual": config.counterfactual,
             **({"context": config.context} if config.context else {}),
+            **said(self.budget),
             "content": {**content_digests(self.tasks, self.everyone), **warm},
         }
 
     def _selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
+        """The selector, kept within the budget where there is one."""
+        from osel_sim.context.appended import LENGTH
+        from osel_sim.selection.budget import Budgeted
+
+        selector = self._free_selector(encoder, configuration)
+        if self.budget is None:
+            return selector
+        self.spending = Budgeted(selector, self.budget, encoder.dimension + (LENGTH if self.config.context else 0), self.config.seed)
+        return self.spending
+
+    def _free_selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
         from osel_sim.context.appended import LENGTH
         from osel_sim.selection.registry import make_selector, wanted_of
 
@@ -245,6 +264,7 @@ class _Run:
 
     def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
         """What watches the run."""
+        from osel_sim.episodes.budget_file import BudgetFile
         from osel_sim.episodes.progress import Progress
         from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
         from osel_sim.episodes.tensorboard import TensorBoard
@@ -253,7 +273,10 @@ class _Run:
         config = self.config
         films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
-        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
+        if self.spending is not None:
+            self.spent = BudgetFile(self.spending, self.weights.success, config.episodes)
+        spent = [self.spent] if self.spent is not None else []
+        return [TimingFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
 
     def _page(self) -> "LivePage | None":
         """Writes the page, if one is wanted."""
@@ -283,7 +306,8 @@ class _Run:
         if self.page is not None and self.page.problem is not None:
             logger.warning("no report.html: %s", self.page.problem)
         page, verdict = (self.page.file, self.page.verdict) if self.page else (None, "")
-        return RunResult(live.folder, summary, tuple(live.decisions), page, interrupted, verdict)
+        spent = self.spent.spent if self.spent is not None else None
+        return RunResult(live.folder, summary, tuple(live.decisions), page, interrupted, verdict, spent)
 
 
 class _Interrupt:

@@ -35,7 +35,7 @@ from osel_sim.formats.summary import check_summary
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome
-from osel_sim.interface.selector import Choice, Selector
+from osel_sim.interface.selector import Choice, Pays, Selector
 from osel_sim.interface.suite import Task
 from osel_sim.selection.reward import RewardWeights, check_reward, reward
 from osel_sim.suites.open_tasks import OpenTasks
@@ -150,7 +150,7 @@ class LiveRun:
                     f"{self._journal.file}, line {decision.index + 1}: says {decision.policy!r} was chosen, this selector now chooses "
                     f"{choice.policy!r} with {choice.propensities}: the run was made with other versions or on another machine"
                 )
-            self._learn(context, choice, decision.reward)
+            self._learn(context, choice, decision)
             known = {decision.policy: decision.reward}
             if self._others is not None:
                 others = self._checked_others(self._others.rows[decision.index][0], decision.index, decision.policy)
@@ -187,7 +187,7 @@ class LiveRun:
         self._journal.append(decision.to_dict())
         self.decisions.append(decision)
         self._remember(rewards)
-        self._learn(context, choice, decision.reward)
+        self._learn(context, choice, decision)
         return decision
 
     def instance_keys(self, count: int) -> frozenset[str]:
@@ -245,9 +245,11 @@ class LiveRun:
     def _reward(self, outcome: Outcome) -> float | None:
         return None if outcome.error is not None else reward(outcome, self.options.weights)
 
-    def _learn(self, context: NDArray[np.float32], choice: Choice, value: float | None) -> None:
-        if value is not None:  # an error teaches nothing
-            self.selector.update(context, choice, value)
+    def _learn(self, context: NDArray[np.float32], choice: Choice, decision: Decision) -> None:
+        if isinstance(self.selector, Pays):
+            self.selector.pay(decision.policy, decision.price)
+        if decision.reward is not None:  # an error teaches nothing
+            self.selector.update(context, choice, decision.reward)
 
     def _remember(self, rewards: dict[str, float | None]) -> None:
         row = [rewards.get(policy) for policy in self.policies]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,19 @@ class Selector(Protocol):
 
     def add_policy(self, name: str) -> None:
         """Make one more policy available; what was learned of the others stays."""
+        ...
+
+
+@runtime_checkable
+class Pays(Protocol):
+    """A selector that wants to know what its choices cost, such as one that keeps to a budget."""
+
+    def pay(self, policy: str, price: float) -> None:
+        """Told once after each choice, before `update`, and where an error leaves nothing to learn too.
+
+        Args:
+            price: cents.
+        """
         ...
 
 

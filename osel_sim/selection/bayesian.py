@@ -194,7 +194,7 @@ class BayesianSelector(SelectorBase):
         of_context = variances - of_mean
         unit = self._deviation * math.sqrt(self._regression.noise)
         hope = unit * (prior.mean_optimism * np.sqrt(of_mean) + prior.optimism * np.sqrt(of_context))
-        scores = self._deviation * (means + rows[:, : len(self._guess)] @ self._guess) - self._costs + hope
+        scores = self._deviation * (means + rows[:, : len(self._guess)] @ self._guess) - self._costs + hope - self._charged
         few = 1.0 + FEW * self._counts / (self._counts + 1.0) ** 2
         chance = prior.mean_chance**2 * few * of_mean + prior.chance**2 * of_context
         propensities = probability_of_best(scores, unit * np.sqrt(chance))
@@ -202,6 +202,12 @@ class BayesianSelector(SelectorBase):
         propensities = (1.0 - random) * propensities + random / len(propensities)
         index = int(self._generator.choice(len(self.policies), p=propensities))
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
+
+    def _expected(self, context: Context) -> Array:
+        self._catch_up()
+        rows = self._rows(context)
+        means, _ = self._regression.predict(rows)
+        return np.asarray(self._deviation * (means + rows[:, : len(self._guess)] @ self._guess) - self._costs, np.float64)
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         sketched, heads = self._see(context)
