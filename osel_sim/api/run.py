@@ -268,6 +268,7 @@ class _Run:
         from osel_sim.episodes.progress import Progress
         from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
         from osel_sim.episodes.tensorboard import TensorBoard
+        from osel_sim.episodes.warnings import WarningFile
         from osel_sim.reporting.view import View
 
         config = self.config
@@ -276,7 +277,7 @@ class _Run:
         if self.spending is not None:
             self.spent = BudgetFile(self.spending, self.weights.success, config.episodes)
         spent = [self.spent] if self.spent is not None else []
-        return [TimingFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
+        return [TimingFile(), WarningFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
 
     def _page(self) -> "LivePage | None":
         """Writes the page, if one is wanted."""

@@ -17,6 +17,7 @@ from osel_sim.episodes.loop import run_episode
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
 from osel_sim.episodes.view import view
+from osel_sim.episodes.warnings import Watch
 from osel_sim.formats.counterfactual import COUNTERFACTUAL, Others, to_others
 from osel_sim.formats.journal import (
     JOURNAL,
@@ -31,6 +32,7 @@ from osel_sim.formats.journal import (
     read_lines,
     to_decision,
 )
+from osel_sim.formats.run_warnings import RunWarning
 from osel_sim.formats.summary import check_summary
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.instance import Instance
@@ -74,6 +76,7 @@ class LiveRun:
 
     Attributes:
         decisions: all so far.
+        warnings: all so far (`osel_sim.episodes.warnings`).
         rewards: of every policy (columns) in every decision (rows), NaN where there is none; only chosen ones without `counterfactual`.
 
     Raises:
@@ -103,6 +106,8 @@ class LiveRun:
             check_digests(folder / name)
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
+        self.warnings: list[RunWarning] = []
+        self._watch = Watch(drivers.specs, [(task.name, level) for task in tasks for level in options.levels])
         self._rows: list[list[float]] = []
         # A journal begun by a version that did not tell scenes stays as it would have been.
         self._tells_scenes = not self.decisions or self.decisions[0].scene is not None
@@ -151,6 +156,7 @@ class LiveRun:
                     f"{choice.policy!r} with {choice.propensities}: the run was made with other versions or on another machine"
                 )
             self._learn(context, choice, decision)
+            self.warnings += self._watch.see(decision)
             known = {decision.policy: decision.reward}
             if self._others is not None:
                 others = self._checked_others(self._others.rows[decision.index][0], decision.index, decision.policy)
@@ -188,6 +194,10 @@ class LiveRun:
         self.decisions.append(decision)
         self._remember(rewards)
         self._learn(context, choice, decision)
+        for warning in self._watch.see(decision):
+            self.warnings.append(warning)
+            for subscriber in self.subscribers:
+                subscriber.on_warning(warning)
         return decision
 
     def instance_keys(self, count: int) -> frozenset[str]:

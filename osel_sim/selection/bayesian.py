@@ -37,6 +37,9 @@ GROWTH = 1.25
 PIECES = 16
 """A change is looked for at the ends of so many equal pieces of what was seen."""
 
+LOOK = 32
+"""Between fits a change is looked for whenever so many decisions more were made, or about a thirtieth of all where that is more."""
+
 WARM = 2000
 """Of more warm contexts than these, evenly spaced ones are taken."""
 
@@ -51,6 +54,7 @@ class Prior:
         optimism, chance: weights of two ways to explore what a policy's success in this context is, >= 0.
         mean_optimism, mean_chance: the same for what its success is in any context.
         floor: the probability with which the n-th choice is made at random is floor / sqrt(n), half at most; in [0, 1].
+        least: it is never below that, so that a policy that nobody chooses any more is seen to become better; in [0, 1].
         alarm: what was seen before a change is forgotten once rewards are so many times as probable with it as without; > 1, infinite for never.
         expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
             learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
@@ -69,6 +73,7 @@ class Prior:
     mean_optimism: float = 0.0
     mean_chance: float = 0.0
     floor: float = 0.0
+    least: float = 0.0
     alarm: float = math.inf
     expected_costs: Mapping[str, float] | None = None
     warm_contexts: ArrayLike | None = None
@@ -82,8 +87,9 @@ class Prior:
                 raise UsageError(f"{name} must be finite and >= 0, got {value}")
         if not self.alarm > 1.0:
             raise UsageError(f"alarm must be greater than 1, got {self.alarm}")
-        if not 0.0 <= self.floor <= 1.0:
-            raise UsageError(f"floor must lie in [0, 1], got {self.floor}")
+        for name in ("floor", "least"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise UsageError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
         if not self.signals or not all(math.isfinite(signal) and signal > 0.0 for signal in self.signals):
             raise UsageError(f"signals must be one or more finite numbers > 0, got {list(self.signals)}")
         if self.parts and (len(self.parts) != 2 or min(self.parts) < 1):
@@ -98,7 +104,8 @@ class Prior:
         parts = {"parts": list(self.parts)} if self.parts else {}
         alarm = {"alarm": float(self.alarm)} if math.isfinite(self.alarm) else {}
         weights = {name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}
-        return {**lists, **weights, **parts, **alarm}
+        least = {"least": float(self.least)} if self.least else {}
+        return {**lists, **weights, **parts, **alarm, **least}
 
 
 class BayesianSelector(SelectorBase):
@@ -118,8 +125,8 @@ class BayesianSelector(SelectorBase):
 
     Whenever the number of decisions has grown by a quarter, features are fitted afresh to the contexts seen so far, and the regression is computed
     again on them; in between it is updated decision by decision. Where a context has two parts, features of the first, of both and of the second are
-    fitted, and those of the highest evidence kept until the next time. Then, too, it is asked whether some policy has become better or worse; if the
-    evidence says so, the decisions before are forgotten (see `alarm` in `Prior`).
+    fitted, and those of the highest evidence kept until the next time. Then, and every `LOOK` decisions between, it is asked whether some policy has
+    become better or worse; if the evidence says so, the decisions before are forgotten (see `alarm` in `Prior`).
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
@@ -198,7 +205,7 @@ class BayesianSelector(SelectorBase):
         few = 1.0 + FEW * self._counts / (self._counts + 1.0) ** 2
         chance = prior.mean_chance**2 * few * of_mean + prior.chance**2 * of_context
         propensities = probability_of_best(scores, unit * np.sqrt(chance))
-        random = min(0.5, prior.floor / math.sqrt(len(self._chosen) + 1))
+        random = max(prior.least, min(0.5, prior.floor / math.sqrt(len(self._chosen) + 1)))
         propensities = (1.0 - random) * propensities + random / len(propensities)
         index = int(self._generator.choice(len(self.policies), p=propensities))
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
@@ -230,7 +237,25 @@ class BayesianSelector(SelectorBase):
             row = np.concatenate([self._heads[at], self._transform(self._contexts[at])[0]])
             target = self._standard(self._targets[at]) - float(self._heads[at] @ self._guess)
             self._regression.update(self._chosen[at], row, target)
-        self._known = count
+        if count > self._known and count % max(LOOK, 1 << max(0, count // LOOK).bit_length() - 1) == 0:
+            self._look(count)
+        self._known = len(self._targets)
+
+    def _look(self, count: int) -> None:
+        """Forget what was before a change that showed itself since the last fit."""
+        if not math.isfinite(self._prior.alarm):
+            return
+        targets, chosen = self._standard(np.array(self._targets)), np.array(self._chosen, np.int64)
+        if change := self._change(np.array(self._contexts, np.float64), chosen, targets):
+            self._forget(count, change)
+
+    def _forget(self, count: int, change: int) -> None:
+        """Forget the first `change` of `count` decisions, and fit what is left."""
+        for seen in (self._contexts, self._heads, self._chosen, self._targets):
+            del seen[:change]
+        self._counts = np.bincount(self._chosen, minlength=len(self.policies))
+        self._next_fit = max(count - change + 1, math.ceil((count - change) * GROWTH))
+        self._fit(count - change)
 
     def _fit(self, count: int) -> None:
         """Scale, features, evidence and regression from the first so many decisions; from the prior alone at first."""
@@ -246,11 +271,7 @@ class BayesianSelector(SelectorBase):
         self._view = int(np.argmax([evidence for evidence, _, _ in found]))
         _, self._signal, self._regression = found[self._view]
         if change := self._change(contexts, chosen, targets):
-            for seen in (self._contexts, self._heads, self._chosen, self._targets):
-                del seen[:change]
-            self._counts = np.bincount(self._chosen, minlength=len(self.policies))
-            self._next_fit = max(count - change + 1, math.ceil((count - change) * GROWTH))
-            self._fit(count - change)
+            self._forget(count, change)
             return
         self._known, self._transformed = count, None
 
@@ -262,7 +283,9 @@ class BayesianSelector(SelectorBase):
         """
         if not math.isfinite(self._prior.alarm) or len(chosen) < PIECES:
             return 0
-        starts = len(chosen) * np.arange(1, PIECES) // PIECES
+        # At the end finer than elsewhere: a change is to be seen soon after it.
+        late = len(chosen) - np.array([step for step in (8, 16, 32, 64, 128) if 16 * step < 2 * len(chosen)], np.int64)
+        starts = np.unique(np.concatenate([len(chosen) * np.arange(1, PIECES) // PIECES, late]))
         heads = np.array(self._heads[: len(targets)], np.float64)
         rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
         left = targets - heads @ self._guess - (rows * self._regression.weights[chosen]).sum(axis=1)
@@ -271,7 +294,7 @@ class BayesianSelector(SelectorBase):
         own = (NOISE_WEIGHT * noise + np.bincount(chosen, left**2, len(self._counts))) / (NOISE_WEIGHT + tried)
         left /= np.sqrt(np.maximum(own, noise))[chosen]
         piece = np.searchsorted(starts, np.arange(len(chosen)), side="right")
-        counts, sums = np.zeros((2, PIECES, len(self._counts)))
+        counts, sums = np.zeros((2, len(starts) + 1, len(self._counts)))
         np.add.at(counts, (piece, chosen), 1.0)
         np.add.at(sums, (piece, chosen), left)
         counts, sums = counts.cumsum(axis=0), sums.cumsum(axis=0)
