@@ -85,19 +85,19 @@ def test_auto_spends_where_it_helps_most_and_knows_what_a_cent_is_worth():
 @pytest.mark.parametrize("name", NAMES)
 def test_every_selector_keeps_to_it_period_by_period_and_goes_on_from_its_state(name):
     chance = np.random.default_rng(3)
-    contexts = chance.normal(size=(40, 4)).astype(np.float32)
-    prices = np.stack([np.zeros(40), 2.0 * chance.random(40)], axis=1)
-    rewards = chance.random((40, 2))
-    whole, first = budgeted(name, 5.0, 20), budgeted(name, 5.0, 20)
+    contexts = chance.normal(size=(24, 4)).astype(np.float32)
+    prices = np.stack([np.zeros(24), 2.0 * chance.random(24)], axis=1)
+    rewards = chance.random((24, 2))
+    whole, first = budgeted(name, 4.0, 12), budgeted(name, 4.0, 12)
     chosen = play(whole, contexts, rewards, prices)
-    spent = prices[np.arange(40), chosen]
-    assert spent[:20].sum() <= 5.0
-    assert spent[20:].sum() <= 5.0
+    spent = prices[np.arange(24), chosen]
+    assert spent[:12].sum() <= 4.0
+    assert spent[12:].sum() <= 4.0
     assert (chosen[spent == 0.0] == 0).all()
-    play(first, contexts[:23], rewards[:23], prices[:23])
-    second = budgeted(name, 5.0, 20)
+    play(first, contexts[:15], rewards[:15], prices[:15])
+    second = budgeted(name, 4.0, 12)
     second.load_state_dict(first.state_dict())
-    assert (play(second, contexts[23:], rewards[23:], prices[23:]) == chosen[23:]).all()
+    assert (play(second, contexts[15:], rewards[15:], prices[15:]) == chosen[15:]).all()
 
 
 def test_what_a_budget_refuses():
