@@ -12,15 +12,16 @@ if TYPE_CHECKING:
     from osel_sim.selection.budget import Budget
 
 
-def budget_of(config: "RunConfig", tasks: "Sequence[Task]", policies: "Sequence[PolicySpec]", everyone: "Sequence[PolicySpec]") -> "Budget | None":
+def budget_of(config: "RunConfig", tasks: "Sequence[Task]", policies: "Sequence[PolicySpec]") -> "Budget | None":
     """The budget that the settings ask for; None where they ask for none.
 
     Args:
-        everyone: the policies and their fallbacks.
+        policies: those that ever join included.
 
     Raises:
         SettingError: it pays for no policy, or there is a period and no budget.
     """
+    from osel_sim.episodes.drivers import with_fallbacks
     from osel_sim.episodes.most_costs import most_costs
     from osel_sim.selection.budget import Budget
 
@@ -30,7 +31,7 @@ def budget_of(config: "RunConfig", tasks: "Sequence[Task]", policies: "Sequence[
         return None
     horizon = max(task.info.horizon for task in tasks)
     try:
-        most = most_costs(policies, everyone, horizon, tasks[0].specification)
+        most = most_costs(policies, with_fallbacks(policies, config.policies_dir), horizon, tasks[0].specification)
         return Budget(config.budget_cents, config.budget_per or config.episodes, most)
     except BudgetError as error:
         raise SettingError("budget_cents", f"{error} (of {horizon} steps, as its file says)") from None

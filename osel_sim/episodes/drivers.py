@@ -145,11 +145,6 @@ class Drivers:
     def __getitem__(self, name: str) -> Driver:
         return self._drivers[name]
 
-    @property
-    def specs(self) -> dict[str, PolicySpec]:
-        """Files of all of them."""
-        return {name: driver.spec for name, driver in self._drivers.items()}
-
     def fallback(self, name: str) -> Driver | None:
         """Who takes over when `name` cannot go on."""
         remote = self._drivers[name].spec.remote

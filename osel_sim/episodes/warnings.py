@@ -7,7 +7,7 @@ from typing import override
 
 from osel_sim.episodes.run_subscribers import Run, RunSubscriber
 from osel_sim.formats.journal import Decision
-from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.formats.policy_file import Price
 from osel_sim.formats.run_warnings import RunWarning, write_warnings
 from osel_sim.interface.outcome import credited
 from osel_sim.statistics.change import RATE, FallDetector
@@ -25,12 +25,12 @@ class Watch:
     rises: a selector that learns makes every policy look better.
 
     Args:
-        specs: files of the policies, by name; those that are missing have no declared price.
+        prices: of the policies by their files; what those that are missing cost is not looked at.
         strata: (task, level) of the decisions to come.
     """
 
-    def __init__(self, specs: Mapping[str, PolicySpec], strata: Collection[tuple[str, int]]) -> None:
-        self._specs = specs
+    def __init__(self, prices: Mapping[str, Price], strata: Collection[tuple[str, int]]) -> None:
+        self._prices = prices
         self._strata = {stratum: number for number, stratum in enumerate(dict.fromkeys(strata))}
         self._detectors: dict[str, FallDetector] = {}
         self._made: dict[str, list[int]] = {}  # policy -> indices of the decisions whose outcomes were looked at
@@ -57,10 +57,10 @@ class Watch:
 
     def _price(self, decision: Decision) -> RunWarning | None:
         """Once for each other price; what messages weighed is in no journal, so a policy that is paid by the megabyte is left out."""
-        spec = self._specs.get(decision.policy)
-        if spec is None or decision.fallback is not None or spec.price.per_megabyte > 0.0:
+        price = self._prices.get(decision.policy)
+        if price is None or decision.fallback is not None or price.per_megabyte > 0.0:
             return None
-        declared = spec.price.of(decision.actions, decision.calls, 0.0)
+        declared = price.of(decision.actions, decision.calls, 0.0)
         ratio = decision.price / declared if declared > 0.0 else float(decision.price > 0.0) + 1.0
         before = self._told.get(decision.policy, 1.0)
         if abs(ratio - before) <= CLOSE * before:

@@ -169,11 +169,12 @@ class Budgeted:
 
     def add_policy(self, name: str) -> None:
         """Make one more policy available, of which the budget has the price."""
-        self._prices[name] = [0.5 * self.budget.of(name), 1.0]
-        self._expected.clear()
-        self.inner.add_policy(name)
-        if self._guide is not None:
-            self._guide.add_policy(name)
+        self._prices.setdefault(name, [0.5 * self.budget.of(name), 1.0])
+        self._change("add_policy", name)
+
+    def retire_policy(self, name: str) -> None:
+        """Take a policy out."""
+        self._change("retire_policy", name)
 
     def state_dict(self) -> State:
         """The state of the selector within, and under `budget.` the rest."""
@@ -206,6 +207,13 @@ class Budgeted:
         if self._guide is not None:
             self._guide.load_state_dict({key.removeprefix("guide."): value for key, value in own.items() if key.startswith("guide.")})
         self.inner.load_state_dict({key: value for key, value in state.items() if not key.startswith("budget.")})
+
+    def _change(self, method: str, name: str) -> None:
+        """Let a policy join or leave: what was expected in recent decisions was of others."""
+        self._expected.clear()
+        for selector in (self.inner, self._guide):
+            if selector is not None:
+                getattr(selector, method)(name)
 
     def _told(self, context: Context) -> Array | None:
         """What the selector within expects of each policy, if it tells."""

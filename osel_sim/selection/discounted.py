@@ -36,6 +36,7 @@ class DiscountedLinUCBSelector(SelectorBase):
 
     name: ClassVar[str] = "linucb_discounted"
     off_policy: ClassVar[bool] = True
+    retires: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -76,6 +77,7 @@ class DiscountedLinUCBSelector(SelectorBase):
         pulls = inverses @ row
         spread = np.sqrt(np.maximum(np.einsum("pi,pij,pj->p", pulls, self._squares + ridge, pulls), 0.0))
         scores = np.einsum("pi,pi->p", pulls, self._vectors) + self._settings["optimism"] * spread - self._charged
+        scores = scores[self.columns]
         best = scores >= scores.max() - 1e-12
         shares = best / best.sum()
         index = int(self._generator.choice(len(self.policies), p=shares))
@@ -85,7 +87,7 @@ class DiscountedLinUCBSelector(SelectorBase):
         return np.asarray(np.einsum("pi,pi->p", self._inverses() @ self._row(context), self._vectors), np.float64)
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
-        discount, index = self._settings["discount"], self.policies.index(choice.policy)
+        discount, index = self._settings["discount"], self.known.index(choice.policy)
         self._space.add(context)
         row = self._row(context)
         self._products *= discount
@@ -102,6 +104,8 @@ class DiscountedLinUCBSelector(SelectorBase):
         return np.asarray(np.linalg.inv(self._products + self._settings["ridge"] * np.eye(self._products.shape[1])), np.float64)
 
     def _add_policy(self, name: str) -> None:
+        if name in self.known:
+            return
         width = self._products.shape[1]
         self._products, self._squares = (np.concatenate([own, np.zeros((1, width, width))]) for own in (self._products, self._squares))
         self._vectors = np.concatenate([self._vectors, np.zeros((1, width))])

@@ -25,6 +25,7 @@ class ThompsonSelector(SelectorBase):
 
     name: ClassVar[str] = "thompson"
     off_policy: ClassVar[bool] = True
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int) -> None:
         super().__init__(policies, context_dim, seed)
@@ -35,7 +36,8 @@ class ThompsonSelector(SelectorBase):
 
     def _select(self, context: Context) -> Choice:
         noise = (1.0 + self._squares) / (1.0 + int(self._counts.sum()))
-        propensities = probability_of_best(self._expected(context) - self._charged, np.sqrt(noise / (self._counts + 1.0)))
+        means, deviations = self._expected(context) - self._charged, np.sqrt(noise / (self._counts + 1.0))
+        propensities = probability_of_best(means[self.columns], deviations[self.columns])
         index = self._generator.choice(len(self.policies), p=propensities)
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
@@ -45,13 +47,15 @@ class ThompsonSelector(SelectorBase):
         return np.asarray((self._counts * self._means + overall) / (self._counts + 1.0), np.float64)
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
-        index = self.policies.index(choice.policy)
+        index = self.known.index(choice.policy)
         self._counts[index] += 1
         before = reward - self._means[index]
         self._means[index] += before / self._counts[index]
         self._squares += before * (reward - self._means[index])
 
     def _add_policy(self, name: str) -> None:
+        if name in self.known:
+            return
         self._counts = np.append(self._counts, 0)
         self._means = np.append(self._means, 0.0)
 

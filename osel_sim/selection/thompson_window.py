@@ -30,6 +30,7 @@ class WindowThompsonSelector(SelectorBase):
 
     name: ClassVar[str] = "thompson_window"
     off_policy: ClassVar[bool] = True
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, *, window: int = 400) -> None:
         super().__init__(policies, context_dim, seed)
@@ -46,20 +47,21 @@ class WindowThompsonSelector(SelectorBase):
 
     def _select(self, context: Context) -> Choice:
         chosen, rewards = self._arrays()
-        counts = np.bincount(chosen, minlength=len(self.policies))
-        means = np.bincount(chosen, rewards, len(self.policies)) / np.maximum(counts, 1)
+        counts = np.bincount(chosen, minlength=len(self.known))
+        means = np.bincount(chosen, rewards, len(self.known)) / np.maximum(counts, 1)
         noise = (1.0 + float(((rewards - means[chosen]) ** 2).sum())) / (1.0 + len(rewards))
-        propensities = probability_of_best(self._expected(context) - self._charged, np.sqrt(noise / (counts + 1.0)))
+        believed, deviations = self._expected(context) - self._charged, np.sqrt(noise / (counts + 1.0))
+        propensities = probability_of_best(believed[self.columns], deviations[self.columns])
         index = self._generator.choice(len(self.policies), p=propensities)
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
     def _expected(self, context: Context) -> NDArray[np.float64]:
         chosen, rewards = self._arrays()
-        counts, sums = np.bincount(chosen, minlength=len(self.policies)), np.bincount(chosen, rewards, len(self.policies))
+        counts, sums = np.bincount(chosen, minlength=len(self.known)), np.bincount(chosen, rewards, len(self.known))
         return np.asarray((sums + (rewards.mean() if len(rewards) else 0.0)) / (counts + 1.0), np.float64)
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
-        self._seen.append((self.policies.index(choice.policy), reward))
+        self._seen.append((self.known.index(choice.policy), reward))
 
     def _arrays(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Columns and rewards in the window."""
