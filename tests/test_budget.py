@@ -226,6 +226,10 @@ def test_a_replay_s_budget_that_pays_for_nothing_is_refused(tmp_path):
     common = {"seeds": 1, "workers": 1, "no_frontier": True, "selectors": ["thompson"]}
     with pytest.raises(SettingError, match=r"budget_cents: 0\.2 cents pay for no decision"):
         osel.replay(log, budget_cents=0.2, out=tmp_path / "none", **common)
+    with pytest.raises(SettingError, match="budget_cents: is for streams that do not change"):
+        osel.replay(log, budget_cents=4, join="remote@5", out=tmp_path / "none", **common)
+    with pytest.raises(SettingError, match="budget_per: is the number of decisions"):
+        osel.replay(log, budget_per=4, out=tmp_path / "none", **common)
     found = osel.replay(log, budget_cents=4, out=tmp_path / "out", **common).result["budget"]
     assert found["cents"][0] == 1.0
     assert 0.0 < found["selectors"]["thompson"][2]["made"] < 1.0  # some decisions could not be paid

@@ -140,6 +140,7 @@ class _Replay:
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
         from osel_sim.analysis.logged_choices import choices_of, has_choices
+        from osel_sim.api.replay_budgets import check_budget
         from osel_sim.api.replay_changes import check_all_outcomes
         from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
 
@@ -166,6 +167,7 @@ class _Replay:
             weights, preset = weights_of(config, recorded=live.reward)
         found = self._off_policy(live, weights)
         check_all_outcomes(config, live.has_all_outcomes(weights))
+        check_budget(config, live.has_all_outcomes(weights))
         if live.has_all_outcomes(weights):
             return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
         write_off_policy(folder, found)
@@ -184,12 +186,13 @@ class _Replay:
         from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import Question, build, tables, with_fixed
-        from osel_sim.api.replay_budgets import plan_budgets_of
+        from osel_sim.api.replay_budgets import check_budget, plan_budgets_of
         from osel_sim.api.replay_changes import changes_asked, replay_changes
         from osel_sim.core.progress import progress
         from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
 
         config, seeds = self.config, range(self.config.seeds)
+        check_budget(config, True)
         if config.context:
             log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)

@@ -15,16 +15,33 @@ WITHIN = ("auto",)
 """Selectors that are replayed within budgets unless others are named: each takes as long again for every budget."""
 
 
-def plan_budgets_of(config: "ReplayConfig", log: "LoggedOutcomes", setup: "Setup", selectors: Sequence[str]) -> "BudgetPlan | None":
-    """What to replay within budgets; None where no budget was given.
+def check_budget(config: "ReplayConfig", known: bool) -> None:
+    """Refuse a budget that could not be replayed, instead of leaving it out.
+
+    Args:
+        known: whether the outcomes of every policy are.
 
     Raises:
-        SettingError: the budget pays for no decision, or there is a period and no budget.
-        DataError: the log lacks prices.
+        SettingError: the stream is to change, or only the outcomes of what was chosen are known.
     """
     if config.budget_cents is None:
         if config.budget_per is not None:
             raise SettingError("budget_per", "is the number of decisions that --budget-cents is for: give that, too")
+        return
+    if config.join or config.leave or config.drift:
+        raise SettingError("budget_cents", "is for streams that do not change: leave --join, --leave and --drift out")
+    if not known:
+        raise SettingError("budget_cents", f"needs the outcomes of every policy: {config.log} has those of what was chosen only")
+
+
+def plan_budgets_of(config: "ReplayConfig", log: "LoggedOutcomes", setup: "Setup", selectors: Sequence[str]) -> "BudgetPlan | None":
+    """What to replay within budgets; None where no budget was given.
+
+    Raises:
+        SettingError: the budget pays for no decision.
+        DataError: the log lacks prices.
+    """
+    if config.budget_cents is None:
         return None
     from dataclasses import replace
 
