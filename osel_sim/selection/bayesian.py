@@ -234,7 +234,8 @@ class BayesianSelector(SelectorBase):
             row = np.concatenate([self._heads[at], self._transform(self._contexts[at])[0]])
             target = self._standard(self._targets[at]) - float(self._heads[at] @ self._guess)
             self._regression.update(self._chosen[at], row, target)
-        if count > self._known and count % max(LOOK, 1 << max(0, count // LOOK).bit_length() - 1) == 0:
+        every = max(LOOK, 1 << (count // LOOK).bit_length() >> 1)  # a power of two of about a thirtieth of all
+        if count > self._known and count % every == 0:
             self._look(count)
         self._known = len(self._targets)
 
