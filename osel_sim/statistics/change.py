@@ -74,7 +74,7 @@ class FallDetector:
             successes: (streams,) truth values.
         """
         rows, stratum, won = np.arange(len(self.sums)), np.atleast_1d(np.asarray(strata, np.int64)), np.atleast_1d(np.asarray(successes, bool))
-        if self._seen % STRIDE == 0:
+        if self._seen % STRIDE == 0 or not self._logs.shape[1]:
             self._begin()
         self._seen += 1
         total, count = self.sums[rows, stratum], self.counts[rows, stratum]
