@@ -11,7 +11,7 @@ from osel_sim.formats.journal import Decision
 from osel_sim.reporting.charts import Figure, Look
 from osel_sim.reporting.curves import Line, curves, thinned
 from osel_sim.reporting.html_tables import Cell, Column, Table
-from osel_sim.reporting.page import Section
+from osel_sim.reporting.page import Block, Section
 
 ORACLES = {
     "hindsight": "hindsight oracle with the same budget",
@@ -69,7 +69,7 @@ def replay_budget(found: Mapping[str, Any] | None) -> list[Section]:
     told = [f"{budget:g} cents {value:.3f}" for budget, value in zip(cents, own[best], strict=True)] if best else []
     text = f"Curves of mean reward over the budget in cents. {best}: {', '.join(told)}."
     panel = curves("", cents, lines, look, (f"budget in cents, {over}", "mean reward"))
-    blocks = [Figure("budget", "Reward at several budgets", caption, text, [panel]), budget_table(found)]
+    blocks: list[Block] = [Figure("budget", "Reward at several budgets", caption, text, [panel]), budget_table(found)]
     return [Section("budget", "Budget", blocks)]
 
 
@@ -105,7 +105,7 @@ def dollar(entries: Sequence[Mapping[str, float]], found: Mapping[str, Any], at:
     if at + 1 == len(entries):
         return None
     gain = (entries[at + 1]["reward"] - entries[at]["reward"]) * found["period"]
-    return 100.0 * gain / float(found["cents"][at + 1] - found["cents"][at])
+    return 100.0 * float(gain) / float(found["cents"][at + 1] - found["cents"][at])
 
 
 def _with_errors(found: Mapping[str, Any], own: Mapping[str, Any]) -> list[Line]:
