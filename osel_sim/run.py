@@ -16,12 +16,14 @@ EXAMPLES = """examples:
   python -m osel_sim.run --task tag:short --level 0 2 --episodes 200       # several tasks and levels, mixed
   python -m osel_sim.run --task all --level 0 2 --selector auto --encoder osel_suite --warm-start assets/logs/suite   # it has seen a log's outcomes
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
+  python -m osel_sim.run --task open_drawer --policies local_small remote_specialist --monitor value   # and who drives on, within the episode
   python -m osel_sim.run --out runs/first --resume                         # goes on with it, if it was cut off
   python -m osel_sim.run --out runs/first --resume --episodes 200          # and on, to more decisions
   python -m osel_sim.run --config runs/first/run.json --seed 1 --out runs/second   # another run with the same settings
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
-contexts.npz, selector.safetensors, summary.json, curve.png, videos/, and report.html, the page about it, with figures/ and tables/ beside it.
+points.jsonl (what a monitor saw), contexts.npz, selector.safetensors, summary.json, curve.png, videos/, and report.html, the page about it, with
+figures/ and tables/ beside it.
 Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 
 
