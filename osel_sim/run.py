@@ -31,10 +31,13 @@ def _execute(config: RunConfig) -> int:
     from osel_sim.api.run import run
     from osel_sim.cli.causes import print_causes
     from osel_sim.cli.console import console, plain, run_table
+    from osel_sim.cli.monitor_words import monitor_words
 
     result = run(config)
     if result.journal:
         console().print(run_table(dict(result.summary)))
+        if config.monitor and "monitor" in result.summary:
+            console().print(plain(monitor_words(config.monitor, result.summary)), soft_wrap=True)
         if result.verdict:
             console().print(plain(result.verdict, "bold"), soft_wrap=True)
         print_causes((decision.policy, f"decision {decision.index}", decision.error) for decision in result.journal if decision.error)

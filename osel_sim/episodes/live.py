@@ -79,6 +79,7 @@ class LiveRun:
     Attributes:
         decisions: all so far.
         rewards: of every policy (columns) in every decision (rows), NaN where there is none; only chosen ones without `counterfactual`.
+        alone: with `counterfactual` and a monitor, what each chosen policy comes to without it; None after an error.
 
     Raises:
         DataError: the folder's files are damaged, or do not fit together.
@@ -111,6 +112,7 @@ class LiveRun:
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
         self._rows: list[list[float]] = []
+        self.alone: list[float | None] = []
         self._horizons = {task.name: max(1, task.info.horizon) for task in tasks}
         # A journal begun by a version that did not tell scenes stays as it would have been.
         self._tells_scenes = not self.decisions or self.decisions[0].scene is not None
@@ -165,6 +167,7 @@ class LiveRun:
             if self._others is not None:
                 others = self._checked_others(self._others.rows[decision.index][0], decision.index, decision.policy)
                 known |= others.rewards
+                self.alone += [others.alone_reward] if others.alone is not None else []
             self._remember(known)
 
     def decide(self) -> Decision:
@@ -234,7 +237,8 @@ class LiveRun:
         if self.monitor is None:
             return ()
         outcome = self._episode(index, instance, start, choice.policy, chosen=False)
-        return outcome, self._reward(outcome)
+        self.alone.append(self._reward(outcome))
+        return outcome, self.alone[-1]
 
     def _instance(self, index: int) -> Instance:
         options = self.options

@@ -1,7 +1,7 @@
 """stable-baselines3's PPO on the sequential problem: the paper's learner, one step further."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, cast, override
+from typing import TYPE_CHECKING, Any, cast, override
 
 import numpy as np
 
@@ -19,7 +19,15 @@ if TYPE_CHECKING:
 
 COMPONENTS = 8
 """Of the picture."""
-SETTINGS = {"learning_rate": 1e-3, "n_steps": 32, "batch_size": 32, "n_epochs": 10, "gamma": 1.0, "gae_lambda": 0.95, "ent_coef": 0.01}
+SETTINGS: dict[str, Any] = {
+    "learning_rate": 1e-3,
+    "n_steps": 32,
+    "batch_size": 32,
+    "n_epochs": 10,
+    "gamma": 1.0,
+    "gae_lambda": 0.95,
+    "ent_coef": 0.01,
+}
 """Of PPO: no discount within an episode, and a larger learning rate and larger rollouts than the paper's, since an episode has several decisions of
 which few matter. Everything else is SB3's default."""
 LAYERS = (64, 64)
