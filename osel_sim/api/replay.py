@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from osel_sim.api.results import ReplayResult
+from osel_sim.api.results import MomentsResult, ReplayResult
 from osel_sim.api.reward import weights_of
 from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, NonNegative, settings
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
@@ -34,7 +34,7 @@ class ReplayConfig(LoggedRewardSettings):
     """Replay a rollout log to selectors: how far from the oracle is each, and is routing worth it?"""
 
     log: Folder
-    """folder of a rollout log, or of a live run"""
+    """folder of a rollout log, of one with moments, or of a live run"""
     selectors: Annotated[Names | None, MAIN] = None
     """ppo, ucb1, auto ... (default: all there are)"""
     policies: Annotated[Names | None, MAIN] = None
@@ -85,7 +85,7 @@ def replay(
     targets: "Mapping[str, Target] | Sequence[Path | str] | Path | str | None" = None,
     on_result: Callable[[ReplayResult], None] | None = None,
     **values: Any,
-) -> ReplayResult:
+) -> ReplayResult | MomentsResult:
     """Show a log's instances in random orders to selectors, each of which sees only the outcome of its choice.
 
     Args:
@@ -97,9 +97,13 @@ def replay(
             frontier. What is yet to come, `ReplayResult.pending` says.
         values: settings by name, as `ReplayConfig` has them.
 
+    Returns:
+        what came of it; of the folder of a table of moments (`record --moments`), monitors and start selectors compared.
+
     Raises:
         OselError: whatever is wrong with the settings or the log; the message says what.
     """
+    from osel_sim.api.replay_moments import has_moments, replay_moments
     from osel_sim.interface.selector import factory_name
 
     factories: dict[str, SelectorFactory] = {}
@@ -112,6 +116,8 @@ def replay(
     if targets is not None and not isinstance(targets, Mapping):
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
+    if has_moments(config.log):
+        return replay_moments(config)
     return _Replay(config, factories, functions, on_result).execute()
 
 
