@@ -1,45 +1,55 @@
-"""Tables of moments whose answer is known."""
+"""A log with moments whose answer is known."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from synthetic_log import make_row
 
-from osel_sim.analysis.log import LoggedInstance, LoggedOutcomes
-from osel_sim.analysis.moment_log import KEPT, MomentLog
-from osel_sim.formats.moments import SIGNALS, Seen
+from osel_sim.context.cache import ContextCache
+from osel_sim.formats.moments import SIGNALS, MomentRow, Seen, write_moments
+from osel_sim.formats.rollout_log import write_rollouts
 
 POLICIES = ("local", "remote")
-CALLS = (4, 8)
+CALLS, STEPS = (4, 8), 100
+ENCODER = "made_up@1"
 
 
-def stuck_log(instances: int = 240, repeats: int = 2, seed: int = 0, seen: bool = True) -> MomentLog:
-    """The local policy is stuck in 40% of the episodes, which the picture at call 4 shows (or with `seen` off, does not), and then fails unless the
-    remote one takes over there; at call 8 it is too late. Otherwise it succeeds, and so does the remote one, for 20 cents."""
+def stuck_log(folder: Path, instances: int = 160, repeats: int = 2, seen: bool = True, seed: int = 0) -> Path:
+    """The local policy is stuck in 40% of the episodes, which pictures show (with `seen` off: do not), and then fails unless the remote one takes over
+    before call 4; before call 8 it is too late. Otherwise it succeeds, and so does the remote one, for 20 cents an episode."""
     random = np.random.default_rng(seed)
-    stuck = random.random((instances, repeats)) < 0.4
-    shape = (instances, 2, repeats, 2)
-    ways = {name: np.zeros((*shape, 2)) for name in KEPT}
-    for at, (before, rescued) in enumerate(((40, True), (80, False))):
-        ways["success"][:, 0, :, at, 0] = ~stuck
-        ways["success"][:, 0, :, at, 1] = ~stuck | rescued
-        ways["success"][:, 1, :, at, :] = 1.0
-        ways["price"][:, 0, :, at, 1], ways["remote_steps"][:, 0, :, at, 1] = 10.0, 100 - before
-        ways["price"][:, 1, :, at, 1], ways["remote_steps"][:, 1, :, at, 1] = 20.0, 100
-        ways["price"][:, 1, :, at, 0], ways["remote_steps"][:, 1, :, at, 0] = 20.0 * before / 100, before
-    ways["subgoals"] = ways["success"].copy()
-    ways["steps"][:] = 100.0
-    ways["seconds"][:] = 5.0
-    own = {name: np.stack([values[:, first, :, 0, first] for first in range(2)], axis=1) for name, values in ways.items()}
-    pictures = random.normal(size=(instances * 2 * repeats * 2, 8)).astype(np.float32)
-    seen_at = np.arange(len(pictures)).reshape(shape)
-    if seen:
-        pictures[seen_at[:, 0], 0] = np.where(stuck, 3.0, -3.0)[..., None]
-    nothing = np.zeros((instances, 2, repeats))
-    about = tuple(LoggedInstance(f"task/test/0/{number}", "task", seed=number, level=0, split="test") for number in range(instances))
-    whole = LoggedOutcomes(
-        Path("synthetic"), about, POLICIES, random.normal(size=(instances, 6)).astype(np.float32), "none", own["success"], own["subgoals"],
-        nothing * np.nan, own["steps"], nothing, nothing, nothing, own["seconds"], own["price"], nothing > 0, nothing > 0, nothing > 0, {},
+    folder.mkdir(parents=True, exist_ok=True)
+    rows, moments, pictures, cache = [], list[MomentRow](), [], ContextCache(folder, autosave=0)
+    for number in range(instances):
+        key = f"task/test/0/{number}"
+        cache.put(ENCODER, key, random.normal(size=6).astype(np.float32))
+        for first, policy in enumerate(POLICIES):
+            for repeat in range(repeats):
+                stuck = first == 0 and bool(random.random() < 0.4)
+                price = 20.0 * first
+                about = {"task": "task", "seed": number, "steps": STEPS, "motion": STEPS / 20.0, "price": price, "calls": 12, "actions": STEPS}
+                rows.append(make_row(key, policy, repeat, not stuck, **about))
+                for call in CALLS:
+                    pictures.append(random.normal(size=8) + np.array([3.0 if stuck == (first == 0) and seen else 0.0] + [0.0] * 7))
+                    moments += _ways(key, first, repeat, call, stuck)
+    write_rollouts(folder, rows, {"encoder": ENCODER, "policies": list(POLICIES)})
+    cache.save()
+    about = {"policies": list(POLICIES), "remote": ["remote"], "encoder": ENCODER, "every": 4, "most": 2}
+    write_moments(folder, moments, Seen(np.array(pictures, np.float32), np.zeros((len(pictures), len(SIGNALS)))), about)
+    return folder
+
+
+def _ways(key: str, first: int, repeat: int, call: int, stuck: bool) -> list[MomentRow]:
+    """Going on, and handing over."""
+    step, price = call * 8, 20.0 * first
+    going_on = MomentRow(
+        key, POLICIES[first], repeat, call, step, None, not stuck, float(not stuck), STEPS, 0.0, 0.0, 0.0, STEPS / 20.0, 12, STEPS, price, price,
+        STEPS * first,
     )  # fmt: skip
-    at_step = np.broadcast_to(np.array([40.0, 80.0]), shape).copy()
-    signals = np.zeros((len(pictures), len(SIGNALS)))
-    return MomentLog(whole, CALLS, ways, at_step, seen_at, Seen(pictures, signals), np.array([False, True]), {"every": 4, "most": 2})
+    if first:
+        handed = replace(going_on, second="local", price=0.2 * step, price_first=0.2 * step, remote_steps=step)
+    else:
+        won = not stuck or call == CALLS[0]
+        handed = replace(going_on, second="remote", success=won, subgoals=float(won), price=10.0, remote_steps=STEPS - step)
+    return [going_on, handed]

@@ -86,7 +86,7 @@ def reward_of(log: MomentLog, handovers: Handovers, weights: RewardWeights) -> A
 
 
 def recovered_and_harmed(log: MomentLog, handovers: Handovers) -> tuple[Array, Array, Array, Array]:
-    """Of each episode, (N, P, R) each: whether the first policy alone loses it, and how likely it is won then; whether it wins, and how likely it is lost."""
+    """Of each episode, (N, P, R) each: does the first policy alone lose it, and how likely is it won then; does it win, and how likely is it lost?"""
     alone, then = log.alone["success"], outcomes(log, handovers)["success"]
     known = np.isfinite(alone) & np.isfinite(then)
     lost, won = np.where(known, 1.0 - alone, np.nan), np.where(known, alone, np.nan)

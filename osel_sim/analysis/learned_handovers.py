@@ -167,5 +167,5 @@ def _models() -> dict[str, Model]:
 
     return {
         "ridge regression": lambda: RidgeCV(np.logspace(0.0, 4.0, 9)),
-        "extremely randomised trees": lambda: ExtraTreesRegressor(60, min_samples_leaf=8, max_features=0.4, random_state=0),
+        "extremely randomised trees": lambda: ExtraTreesRegressor(30, min_samples_leaf=8, max_features=0.4, random_state=0),
     }

@@ -25,7 +25,7 @@ def verdict(result: Mapping[str, Any]) -> dict[str, Any]:
     candidates = [arm for arm in arms if arm["start"] == start and arm["monitor"] != "never" and arm.get("gain")]
     if not candidates:
         return {"decision": "do_not", "start": start, "monitor": None, "headline": "Do not hand over: no monitor was compared", "sentences": []}
-    best = max(candidates, key=lambda arm: arm["gain"][1])
+    best = max(candidates, key=lambda arm: arm["gain"][0])
     gain, low, high = best["gain"]
     if low > 0.0 and best["p_reward_holm"] < ERROR:
         decision, headline = "hand_over", f"Hand over by {best['monitor']}"

@@ -113,7 +113,7 @@ def _gains(result: Mapping[str, Any]) -> list[Block]:
             "gains",
             "What handing over gains, from the same state",
             "Reward of handing over before that call minus the reward of going on, in episodes that were not over by then, with 95% intervals over "
-            "instances. Of a blind handover: a monitor gains more, where it sees which of them to hand over. Later moments are of fewer, harder episodes.",
+            "instances. Of a blind handover: a monitor that sees which of them to hand over gains more. Later moments are of fewer and harder ones.",
             f"Most on {best['task']}: {best['first']} to {best['second']} before call {best['call']}, {best['gain']['value']:+.2f}.",
             panels,
         )
