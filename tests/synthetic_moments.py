@@ -16,7 +16,7 @@ ENCODER = "made_up@1"
 
 
 def stuck_log(folder: Path, instances: int = 160, repeats: int = 2, seen: bool = True, seed: int = 0) -> Path:
-    """The local policy is stuck in 40% of the episodes, which pictures show (with `seen` off: do not), and then fails unless the remote one takes over
+    """The local policy is stuck in 40% of the episodes, which pictures show (not with `seen` off), and then fails unless the remote one takes over
     before call 4; before call 8 it is too late. Otherwise it succeeds, and so does the remote one, for 20 cents an episode."""
     random = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)

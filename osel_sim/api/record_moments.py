@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 _SETTINGS = {"moments": "every", "most_moments": "most"}
 """Setting -> key of `moments` in run.json."""
-BLOCK = 2
+BLOCK = 1
 """So many instances of each task and level are recorded before those of the next task, for the sake of recordings that are interrupted."""
 
 
@@ -36,7 +36,7 @@ def cuts_of(config: "RecordConfig") -> "Cuts | None":
 
 
 def check_moments(plan: "Plan") -> None:
-    """Refuse moments of tasks that have no snapshots, or no horizon, and of a single policy.
+    """Refuse moments of tasks that have no snapshots, and of a single policy.
 
     Raises:
         SettingError: naming the task.
@@ -44,8 +44,8 @@ def check_moments(plan: "Plan") -> None:
     if plan.cuts is None:
         return
     for task in plan.tasks:
-        if not task.specification.snapshots or task.specification.horizon is None:
-            raise SettingError("moments", f"{task.name} cannot go back to a moment of an episode: its suite has no snapshots, or no horizon")
+        if not task.specification.snapshots:
+            raise SettingError("moments", f"{task.name} cannot go back to a moment of an episode: its suite has no snapshots")
     if len(plan.policies) < 2:
         raise SettingError("moments", f"{plan.policies[0].name} alone has nobody to hand over to: name another policy after --policies")
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from osel_sim.api.results import MomentsResult, ReplayResult
 from osel_sim.api.reward import weights_of
 from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, NonNegative, settings
-from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, SettingError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.encoder_choice import EncoderChoice
@@ -41,6 +41,8 @@ class ReplayConfig(LoggedRewardSettings):
     """policies to choose from (default: all of the log)"""
     seeds: Annotated[Count, MAIN] = 20
     """number of random orders"""
+    monitors: Annotated[Names | None, MAIN] = None
+    """of a log with moments: stall, value, blind:6:remote_large ... (default: stall, disagreement and value)"""
     decisions: Annotated[Count | None, MAIN] = None
     """length of a stream (default: all instances)"""
     half: Annotated[Literal["choose", "score"] | None, MAIN] = None
@@ -118,6 +120,8 @@ def replay(
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
     if has_moments(config.log):
         return replay_moments(config)
+    if config.monitors:
+        raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
     return _Replay(config, factories, functions, on_result).execute()
 
 

@@ -1,6 +1,6 @@
 """A replay of a table of moments: start selectors and monitors compared on what would have come of every handover."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 SELECTORS = ("auto", "auto:warm")
 """Start selectors that are compared unless others are named."""
+MONITORS = ("stall", "disagreement", "value")
+"""Monitors that are compared unless others are named."""
 _NOT_HERE = ("decisions", "unknown_costs", "unknown_skills", "no_frontier", "route_with", "targets", "context")
 """Settings of other replays."""
 
@@ -53,7 +55,7 @@ def replay_moments(config: "ReplayConfig") -> MomentsResult:
         log = log.only(tuple(config.policies))
     weights, preset = weights_of(config, log.whole.metadata)
     part = _part(log, config.half or "score")
-    monitors, about = _monitors(log, weights, part)
+    monitors, about = _monitors(log, weights, part, config.monitors or MONITORS)
     starts = Starts(selectors, range(config.seeds), config.workers)
     result = study(log, weights, monitors, Question(starts, part, config.margin))
     metadata = log.metadata
@@ -87,14 +89,18 @@ def _part(log: "MomentLog", half: Any) -> "Part":
     return Part(scored, ~scored)
 
 
-def _monitors(log: "MomentLog", weights: "RewardWeights", part: "Part") -> "tuple[dict[str, Handovers], dict[str, Any]]":
+def _monitors(log: "MomentLog", weights: "RewardWeights", part: "Part", names: Sequence[str]) -> "tuple[dict[str, Handovers], dict[str, Any]]":
     """What is compared besides never handing over, and what was decided of it on the other half."""
+    from osel_sim.analysis.asked_monitors import asked_turns
+    from osel_sim.analysis.handovers import first_turns
     from osel_sim.analysis.moment_monitors import BLIND, LEARNED, best_blind, learned
 
-    without_looking, names = best_blind(log, weights, part)
+    without_looking, calls = best_blind(log, weights, part)
     by_all, chosen = learned(log, weights, part)
-    found = {BLIND: without_looking, LEARNED: by_all}
-    about: dict[str, Any] = {BLIND: names, LEARNED: {policy: asdict(own) for policy, own in chosen.items()}}
+    found = {BLIND: without_looking}
+    found |= {name: first_turns(log, asked_turns(log, weights, name, part.shown, part.scored)) for name in dict.fromkeys(names) if name != "never"}
+    found[LEARNED] = by_all
+    about: dict[str, Any] = {BLIND: calls, LEARNED: {policy: asdict(own) for policy, own in chosen.items()}}
     for name, look, signals in (("learned, no picture", False, True), ("learned, no signals", True, False)):
         found[name], own = learned(log, weights, part, look, signals)
         about[name] = {policy: asdict(one) for policy, one in own.items()}

@@ -98,18 +98,19 @@ class MomentRunner:
     encoder: Encoder
     action_noise: float = 0.0
 
-    def run(self, env: Environment, instance: Instance, first: str, repeat: int = 0) -> tuple[Outcome, Moments]:
+    def run(self, env: Environment, instance: Instance, first: str, horizon: int, repeat: int = 0) -> tuple[Outcome, Moments]:
         """Let `first` drive an episode to its end, then every other policy from each of its moments.
 
         Args:
-            env: holds `instance`, just loaded or restored; has snapshots and a horizon.
+            env: holds `instance`, just loaded or restored; has snapshots.
+            horizon: control steps after which the episode ends, where `env` does not say.
             repeat: as `run_episode` takes it.
 
         Returns:
             the outcome of the episode, as `run_episode` gives it without moments, and its moments.
         """
         drivers, cutter = self.drivers, _Cutter(self.cuts.most)
-        handoffs = Handoffs(drivers, self.policies, _Never(), self.cuts.every, env.specification.horizon or 0, self.encoder, cutter)
+        handoffs = Handoffs(drivers, self.policies, _Never(), self.cuts.every, env.specification.horizon or horizon, self.encoder, cutter)
         driver, fallback = drivers[first], drivers.fallback(first)
         outcome = run_episode(env, instance, driver, fallback, repeat=repeat, action_noise=self.action_noise, handoffs=handoffs)
         remote = {name for name in self.policies if drivers[name].spec.is_remote}

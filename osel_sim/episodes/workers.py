@@ -155,6 +155,7 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
         sys.modules["torch"].set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
     envs = OpenTasks(plan.tasks, keep=KEPT_OPEN)  # work comes task by task, or some instances of each in turn
 
+    horizons = {task.name: max(1, task.info.horizon) for task in plan.tasks}
     runner = None if plan.cuts is None else MomentRunner(drivers, [spec.name for spec in plan.policies], plan.cuts, encoder, plan.action_noise)
 
     def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | tuple[Row, Moments | None]]":
@@ -166,7 +167,7 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
         for policy, repeat in job.episodes[max(0, start - 1) :]:
             begin.again()
             if runner is not None:
-                outcome, moments = runner.run(env, instance, policy, repeat)
+                outcome, moments = runner.run(env, instance, policy, horizons[instance.task], repeat)
                 yield make_row(instance, policy, repeat, outcome, begin.scene), moments
                 continue
             outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat, action_noise=plan.action_noise)
