@@ -8,11 +8,14 @@ from test_episode import HORIZON, PRICE, LoggedEnv, Numbered, made, spec
 
 from osel_sim.core import content
 from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.episodes.handoff_episodes import handoff_episodes
 from osel_sim.episodes.handoffs import Handoffs
 from osel_sim.episodes.loop import Driver, Subscriber, run_episode
 from osel_sim.episodes.moment import go_on
 from osel_sim.formats.task_file import load_task_file
 from osel_sim.interface.monitor import Turn
+from osel_sim.selection.monitors.environment import HandoffEnv
+from osel_sim.selection.reward import RewardWeights, reward, to_go
 from osel_sim.sim.instance import make_instance
 
 
@@ -155,6 +158,49 @@ def test_going_on_from_a_moment_is_what_handing_over_there_would_have_been(env, 
         assert outcome.monitored.by_policy == live.monitored.by_policy and outcome.monitored.handoffs == live.monitored.handoffs
     with pytest.raises(UsageError, match="another policy than 'small'"):
         go_on(moments[1], "small")
+
+
+class ChunkedEnv(LoggedEnv):
+    """Takes several actions at once, as an environment in another process does."""
+
+    def advance_chunk(self, actions):
+        self.chunks = getattr(self, "chunks", 0) + 1
+        for number, action in enumerate(actions):
+            if self.done:
+                return number
+            self.advance(action)
+        return len(actions)
+
+
+def test_environments_that_take_chunks_come_to_the_same(env, instance):
+    chunked, outcomes = ChunkedEnv(env.task), []
+    for world, name in ((env, "blocking"), (chunked, "blocking"), (env, "async"), (chunked, "async")):
+        drivers = fleet(small=Numbered(), **{name: Numbered(inference=0.2)})
+        world.load(instance)
+        outcomes.append(run_episode(world, instance, drivers["small"], handoffs=handoffs(drivers, Told({1: name}, asks={1: name, 2: "small"}))))
+    assert chunked.chunks > 4 and outcomes[0] == outcomes[1] and outcomes[2] == outcomes[3]
+    chunked.close()
+
+
+def test_real_episodes_as_a_sequential_problem(env, instance):
+    """As `HandoffEnv` is made of them: the rewards sum to the reward-to-go from the first decision point."""
+    drivers = fleet(small=Numbered(), blocking=Numbered(inference=0.2))
+    weights = RewardWeights(0.2, 0.01)
+    begin = handoff_episodes(env, [instance], handoffs(drivers, Told()), weights, lambda point: np.array([point.step], np.float32))
+    problem, seen = HandoffEnv(begin, tuple(drivers), 1), Points()
+    row, _ = problem.reset(seed=0)
+    total, over, steps = 0.0, False, [int(row[0])]
+    while not over:
+        row, reward_then, over, _, _ = problem.step(1)
+        steps.append(int(row[0]))
+        total += reward_then
+    first = "small" if steps[0] == 8 else "blocking"
+    env.load(instance)
+    turns = {call: "blocking" for call in range(1, 9)}
+    outcome = run_episode(env, instance, drivers[first], subscribers=[seen], handoffs=handoffs(drivers, Told(turns)))
+    point = seen.points[0]
+    assert steps[:-1] == [point.step for point in seen.points]
+    assert total == pytest.approx(to_go(reward(outcome, weights), [point.seconds], [point.step], [point.price], weights)[0])
 
 
 def test_what_a_monitor_gets_wrong_is_told(env, instance):

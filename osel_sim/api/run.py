@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from osel_sim.episodes.run_subscribers import RunSubscriber
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.interface.encoder import Encoder
+    from osel_sim.interface.monitor import MonitorFactory
     from osel_sim.interface.policy import Policy
     from osel_sim.interface.selector import Selector, SelectorFactory
     from osel_sim.interface.suite import Task
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | SelectorFactory
+    MonitorLike = str | MonitorFactory
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +40,7 @@ def run(
     *,
     policies: "Sequence[str | Policy | PolicyObject] | None" = None,
     selector: "SelectorLike | None" = None,
+    monitor: "MonitorLike | None" = None,
     subscribers: "Sequence[RunSubscriber]" = (),
     **values: Any,
 ) -> RunResult:
@@ -47,6 +50,7 @@ def run(
         config: settings as one object; `values` change some of them.
         policies: names of policy files, or objects with `reset` and `act` (`osel_sim.as_policy` says what they are shown and cost).
         selector: name of a selector, or a class or function of one's own: called with the policies' names, the context's length and the seed.
+        monitor: name of a monitor, or a class or function of one's own (`osel_sim.interface.monitor.MonitorFactory`).
         subscribers: what else watches the run (`osel_sim.episodes.run_subscribers`), beside progress, timings, TensorBoard and the page.
         values: settings by name, as `RunConfig` has them.
 
@@ -63,13 +67,17 @@ def run(
     if selector is not None:
         values["selector"] = selector if isinstance(selector, str) else factory_name(selector)
         factory = None if isinstance(selector, str) else selector
+    watch = None
+    if monitor is not None:
+        values["monitor"] = monitor if isinstance(monitor, str) else factory_name(monitor)
+        watch = None if isinstance(monitor, str) else monitor
     config = RunConfig.of(**values) if config is None else config.changed(**values)
     if config.resume and not config.task and config.out is not None:
         from osel_sim.api.run_resume import settings_then
 
         config = config.of(**settings_then(config.out) | {name: getattr(config, name) for name in config.given})
     with trusting(config.trust):
-        return _Run(config, objects, factory, subscribers).execute()
+        return _Run(config, objects, factory, subscribers, watch).execute()
 
 
 class _Run:
@@ -79,6 +87,7 @@ class _Run:
         objects: policies that no file describes.
         factory: makes the selector where it is none of the registry's.
         watchers: subscribers of the caller's own.
+        monitor: makes the monitor where it is none of the registry's.
     """
 
     def __init__(
@@ -87,13 +96,15 @@ class _Run:
         objects: "Mapping[str, PolicyObject]",
         factory: "SelectorFactory | None",
         watchers: "Sequence[RunSubscriber]",
+        monitor: "MonitorFactory | None" = None,
     ) -> None:
         from osel_sim.api.reward import weights_of
+        from osel_sim.api.run_monitor import check_monitor
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
-        self.config, self.objects, self.factory, self.watchers = config, objects, factory, watchers
+        self.config, self.objects, self.factory, self.watchers, self.monitor = config, objects, factory, watchers, monitor
         if config.tensorboard:
             from osel_sim.episodes.tensorboard import check_installed
 
@@ -104,6 +115,7 @@ class _Run:
         self.everyone = with_fallbacks(self.policies, config.policies_dir)
         self.weights = weights_of(config)[0]
         self._check_selector()
+        check_monitor(config, monitor, self.policies)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
@@ -189,6 +201,7 @@ class _Run:
 
     def _configuration(self) -> dict[str, Any]:
         """Everything the journal depends on but the encoder, content of files included."""
+        from osel_sim.api.run_monitor import monitor_said
         from osel_sim.core.files import digest
         from osel_sim.formats.rollout_log import ROLLOUTS
         from osel_sim.formats.run_config import content_digests, robots_said
@@ -209,6 +222,7 @@ class _Run:
             "reward": asdict(self.weights),
             "counterfactual": config.counterfactual,
             **({"context": config.context} if config.context else {}),
+            **monitor_said(config),
             "content": {**content_digests(self.tasks, self.everyone), **warm},
         }
 
@@ -235,13 +249,15 @@ class _Run:
         return log.with_tasks() if self.config.context else log
 
     def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
+        from osel_sim.api.run_monitor import make_run_monitor
         from osel_sim.episodes.live import LiveOptions, LiveRun
 
         config = self.config
         options = LiveOptions(
             config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context
         )
-        return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder))
+        monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
+        return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder), monitor)
 
     def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
         """What watches the run."""

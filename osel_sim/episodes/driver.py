@@ -38,3 +38,8 @@ class Tally:
 def episode_seed(instance_key: str, policy: str, repeat: int) -> tuple[int, ...]:
     """What fixes an episode's chance (network delays, noise on actions): the instance, the policy and the repeat, never the order of episodes."""
     return (*(int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") for text in (instance_key, policy)), repeat)
+
+
+def monitor_seed(instance: str, policy: str, repeat: int = 0) -> tuple[int, ...]:
+    """What fixes a monitor's chance in an episode: the instance, the policy that drives first, and the repeat."""
+    return (*episode_seed(instance, policy, repeat), 2)

@@ -21,7 +21,7 @@ import numpy as np
 
 from osel_sim.core.errors import SuiteHostError
 from osel_sim.episodes.driver import Driver as Driver
-from osel_sim.episodes.driver import Tally
+from osel_sim.episodes.driver import Tally, monitor_seed
 from osel_sim.episodes.driver import episode_seed as episode_seed
 from osel_sim.episodes.handoffs import Answer, Course, Handoffs, Watch, decided, difference
 from osel_sim.interface.call import Call, Privileged
@@ -104,11 +104,25 @@ def run_episode(
         the outcome. `calls` and `actions` are the driver's own (with `handoffs` those of all that the monitor let drive); `price` and `seconds`
         contain the fallback's, `fallback_steps` says how far it drove.
     """
+    if handoffs is not None:
+        handoffs.monitor.reset(instance.instruction, driver.spec.name, monitor_seed(instance.key, driver.spec.name, repeat))
+    return decided(course(env, instance, driver, fallback, subscribers, repeat, action_noise, handoffs), handoffs)
+
+
+def course(
+    env: Environment,
+    instance: Instance,
+    driver: Driver,
+    fallback: Driver | None = None,
+    subscribers: Sequence[Subscriber] = (),
+    repeat: int = 0,
+    action_noise: float = 0.0,
+    handoffs: Handoffs | None = None,
+) -> Course[Outcome]:
+    """The same, one decision point after the other: whoever goes through it says who drives on, the monitor is not asked."""
     noise = _Noise(action_noise, env.specification.action, (*episode_seed(instance.key, driver.spec.name, repeat), 1))
     episode = Episode(env, instance, subscribers, noise, repeat, handoffs)
-    if handoffs is not None:
-        handoffs.monitor.reset(instance.instruction, driver.spec.name, (*episode_seed(instance.key, driver.spec.name, repeat), 2))
-    return decided(episode.course(episode.drive(driver), fallback), handoffs)
+    return episode.course(episode.drive(driver), fallback)
 
 
 class _Noise:

@@ -25,13 +25,13 @@ def go_on(moment: Moment, policy: str, why: str = "", subscribers: Sequence[Subs
     Raises:
         UsageError: the driver is to hand over to itself (what comes of that, the episode itself tells), or there is no such policy.
     """
-    kept = moment.episode
-    if kept.watch is None or policy == moment.point.driver:
+    episode = moment.episode.twin()
+    watch = episode.watch
+    if watch is None or policy == moment.point.driver:
         raise UsageError(f"an episode goes on from a decision point with another policy than {policy!r}, which drives there already")
     turn = Turn(policy, why)
-    turn.check(kept.watch.handoffs.policies)
-    episode = kept.twin()
+    turn.check(watch.handoffs.policies)
     episode.show_to(subscribers)
     episode.env.restore(moment.snapshot)
-    driver, _ = episode.watch.hand_over(episode, turn)
+    driver, _ = watch.hand_over(episode, turn)
     return decided(episode.course(episode.drive_on(driver, decide=False), None), None)
