@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from annotated_types import Ge, Le
 
+from osel_sim.api.record_moments import as_begun as moments_as_begun
+from osel_sim.api.record_moments import check_moments, cuts_of, in_blocks, said_of
 from osel_sim.api.results import RecordResult
 from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Folder, Group, Index, InstanceSettings, Names, settings
 from osel_sim.api.until_decided import baseline_then, concluded, instances_of, said, stopping
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 STOPPING = Group("Stopping early", 0.5)
+HANDOFFS = Group("Handing over within an episode", 0.4)
 _FIXED = {"task": "tasks", "level": "levels", "axis": "axes"} | {name: name for name in ("instances", "start_seed", "action_noise", "split")}
 """Setting -> key in run.json of what a recording keeps from its beginning to its end."""
 
@@ -59,6 +62,10 @@ class RecordConfig(InstanceSettings, ContentSettings):
     """with --until-decided: log to compare with; without --task, its instances are taken"""
     baseline_policy: Annotated[str | None, STOPPING] = None
     """policy of --baseline, where that has several (default: the one that is recorded)"""
+    moments: Annotated[Count | None, HANDOFFS] = None
+    """cut every episode before every so many calls, and let every other policy drive on from there: moments.parquet, for replay (docs/moments.md)"""
+    most_moments: Annotated[Count | None, HANDOFFS] = None
+    """with --moments: cut an episode so many times at most (default: until it is over)"""
     start_seed: Annotated[Index, INSTANCES] = 0
     """seed of the first instance"""
 
@@ -107,6 +114,7 @@ def _record(config: RecordConfig, folder: Path, baseline: "LoggedOutcomes | None
     from osel_sim.remote.policy import check_servers
 
     plan = _plan(config)
+    check_moments(plan)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
     before = read_run(folder) if config.resume and (folder / RUN).exists() else None
     stop = None
@@ -196,6 +204,7 @@ def _plan(config: RecordConfig) -> "Plan":
         repeat_every=config.repeat_every or 1,
         axes=parse_axes(config.axis, known_axes(tasks)),
         action_noise=config.action_noise,
+        cuts=cuts_of(config),
     )
 
 
@@ -216,6 +225,7 @@ def _configuration(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
         "action_noise": config.action_noise,
         "split": config.split,
         "content": content_digests(plan.tasks, plan.everyone),
+        **said_of(plan.cuts),
     }
 
 
@@ -243,6 +253,7 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
         values["policies"] = tuple(dict.fromkeys([*began["policies"], *(config.policies or ())]))
         values["encoder"] = config.encoder or began["encoder"].partition("@")[0]
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
+        values |= moments_as_begun(config, given, began, folder / RUN)
         if "until_decided" in began:
             values |= {"until_decided": True, "baseline": config.baseline or baseline_then(run.get("settings"), folder)}
             values |= {"baseline_policy": began["until_decided"].get("baseline_policy"), "margin": began["until_decided"]["margin"]}
@@ -314,6 +325,8 @@ def _record_missing(recording: "Recording", workers: int, stop: "UntilDecided | 
     plan, missing = recording.plan, recording.missing()
     if stop is not None:
         missing = {key: missing[key] for key in stop.order if key in missing}
+    if plan.cuts is not None:
+        missing = {key: missing[key] for key in in_blocks(missing, plan)}
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
     unit = "episode" if left else "context"
     logger.info("starting %d workers: they load the encoder%s ...", workers, ", policies and servers" if left else "")

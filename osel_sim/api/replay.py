@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from osel_sim.api.results import ReplayResult
+from osel_sim.api.results import MomentsResult, ReplayResult
 from osel_sim.api.reward import weights_of
 from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, NonNegative, settings
-from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, SettingError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.encoder_choice import EncoderChoice
@@ -34,13 +34,15 @@ class ReplayConfig(LoggedRewardSettings):
     """Replay a rollout log to selectors: how far from the oracle is each, and is routing worth it?"""
 
     log: Folder
-    """folder of a rollout log, or of a live run"""
+    """folder of a rollout log, of one with moments, or of a live run"""
     selectors: Annotated[Names | None, MAIN] = None
     """ppo, ucb1, auto ... (default: all there are)"""
     policies: Annotated[Names | None, MAIN] = None
     """policies to choose from (default: all of the log)"""
     seeds: Annotated[Count, MAIN] = 20
     """number of random orders"""
+    monitors: Annotated[Names | None, MAIN] = None
+    """of a log with moments: stall, value, blind:6:remote_large ... (default: stall, disagreement and value)"""
     decisions: Annotated[Count | None, MAIN] = None
     """length of a stream (default: all instances)"""
     half: Annotated[Literal["choose", "score"] | None, MAIN] = None
@@ -85,7 +87,7 @@ def replay(
     targets: "Mapping[str, Target] | Sequence[Path | str] | Path | str | None" = None,
     on_result: Callable[[ReplayResult], None] | None = None,
     **values: Any,
-) -> ReplayResult:
+) -> ReplayResult | MomentsResult:
     """Show a log's instances in random orders to selectors, each of which sees only the outcome of its choice.
 
     Args:
@@ -97,9 +99,13 @@ def replay(
             frontier. What is yet to come, `ReplayResult.pending` says.
         values: settings by name, as `ReplayConfig` has them.
 
+    Returns:
+        what came of it; of the folder of a table of moments (`record --moments`), monitors and start selectors compared.
+
     Raises:
         OselError: whatever is wrong with the settings or the log; the message says what.
     """
+    from osel_sim.api.replay_moments import has_moments, replay_moments
     from osel_sim.interface.selector import factory_name
 
     factories: dict[str, SelectorFactory] = {}
@@ -112,6 +118,10 @@ def replay(
     if targets is not None and not isinstance(targets, Mapping):
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
+    if has_moments(config.log):
+        return replay_moments(config)
+    if config.monitors:
+        raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
     return _Replay(config, factories, functions, on_result).execute()
 
 
