@@ -143,6 +143,7 @@ class _Run:
             return self._run(folder, configuration, holding)
 
     def _run(self, folder: Path, configuration: dict[str, Any], holding: contextlib.ExitStack) -> RunResult:
+        from osel_sim.api.run_monitor import start_monitor_warm
         from osel_sim.context.encoder import load_encoder
         from osel_sim.context.names import DEFAULT_ENCODER
         from osel_sim.formats.journal import JOURNAL
@@ -174,6 +175,7 @@ class _Run:
             stack.callback(live.close)
             if seen is not None:
                 self._start_warm(live, seen)
+            start_monitor_warm(config, live, self.grown_from)
             live.replay()
             if self.grown_from is not None:
                 note_growth(folder, config.episodes)

@@ -61,6 +61,8 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """who drives on within an episode is decided by: value, blind:K:TO, stall, random:P ... (--list)"""
     decide_every: Annotated[Count, OTHER] = 4
     """with --monitor: a decision point is every so many calls"""
+    monitor_warm_start: Annotated[Folder | None, OTHER] = None
+    """log with a table of moments (record --moments) that the monitor is shown first (value)"""
 
     @property
     def folder(self) -> Path:
