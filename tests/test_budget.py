@@ -219,7 +219,7 @@ def test_a_replay_within_budgets_against_the_oracle_with_as_much(tmp_path):
     assert auto[2]["reward"] > mix[2]
     assert found["dual_prices"] == sorted(found["dual_prices"], reverse=True)
     page = osel.report(tmp_path / "out")
-    assert "Reward at several budgets" in page.read_text()
+    assert "Reward at several budgets" in page.page.read_text()
 
 
 def test_a_replay_s_budget_that_pays_for_nothing_is_refused(tmp_path):

@@ -29,6 +29,8 @@ def budget_of(config: "RunConfig", tasks: "Sequence[Task]", policies: "Sequence[
         if config.budget_per is not None:
             raise SettingError("budget_per", "is the number of decisions that --budget-cents is for: give that, too")
         return None
+    if config.monitor is not None:
+        raise SettingError("budget_cents", "cannot be kept where a monitor hands over within the episode: leave --monitor out")
     horizon = max(task.info.horizon for task in tasks)
     try:
         most = most_costs(policies, with_fallbacks(policies, config.policies_dir), horizon, tasks[0].specification)

@@ -22,7 +22,7 @@ class Watch:
 
     A policy's successes are compared with what it came to in the same task at the same level (`osel_sim.statistics.change`), since selectors learn to
     send a policy where it is good. Within those, which of the instances it gets must not become harder than before. Falls are looked for and no
-    rises: a selector that learns makes every policy look better.
+    rises: a selector that learns makes every policy look better. Decisions that a monitor watched are left out: who drove is not one policy's doing.
 
     Args:
         prices: of the policies by their files; what those that are missing cost is not looked at.
@@ -38,7 +38,7 @@ class Watch:
 
     def see(self, decision: Decision) -> list[RunWarning]:
         """Take one more decision into account. Returns what there is to say."""
-        if decision.error is not None:
+        if decision.error is not None or decision.monitored is not None:
             return []
         found = [self._price(decision), self._success(decision)]
         return [warning for warning in found if warning is not None]

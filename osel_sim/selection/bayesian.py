@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
+from osel_sim.selection.change_point import PIECES, change_point
 from osel_sim.selection.features import Array, Features, Part, Sketch, warm_table
-from osel_sim.selection.regression import NOISE_WEIGHT, Moments, SharedRegression, fit
+from osel_sim.selection.regression import Moments, SharedRegression, fit
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, UNKNOWN, Skills
 from osel_sim.statistics.best import probability_of_best
 
@@ -32,9 +33,6 @@ NOTHING = 1e-6
 
 GROWTH = 1.25
 """Features and evidence are computed afresh whenever there are this many times as many decisions."""
-
-PIECES = 16
-"""A change is looked for at the ends of so many equal pieces of what was seen."""
 
 LOOK = 32
 """Between fits a change is looked for whenever so many decisions more were made, or about a thirtieth of all where that is more."""
@@ -241,10 +239,8 @@ class BayesianSelector(SelectorBase):
 
     def _look(self, count: int) -> None:
         """Forget what was before a change that showed itself since the last fit."""
-        if not math.isfinite(self._prior.alarm):
-            return
-        targets, chosen = self._standard(np.array(self._targets)), np.array(self._chosen, np.int64)
-        if change := self._change(np.array(self._contexts, np.float64), chosen, targets):
+        seen = np.array(self._contexts, np.float64), np.array(self._chosen, np.int64), self._standard(np.array(self._targets))
+        if change := self._change(*seen):
             self._forget(count, change)
 
     def _forget(self, count: int, change: int) -> None:
@@ -274,32 +270,13 @@ class BayesianSelector(SelectorBase):
         self._known, self._transformed = count, None
 
     def _change(self, contexts: Array, chosen: NDArray[np.int64], targets: Array) -> int:
-        """How many of the decisions to forget: those before policies became better or worse than the contexts explain; 0 where nothing changed.
-
-        What the regression leaves unexplained has mean 0 for every policy, at all times, however choices changed while it was learned. Compared is
-        that with means of their own before and after a change (Gaussian, of prior variance 1 relative to the noise), wherever it was.
-        """
+        """How many of the decisions to forget: those before policies became better or worse than the contexts explain; 0 where nothing changed."""
         if not math.isfinite(self._prior.alarm) or len(chosen) < PIECES:
             return 0
-        # At the end finer than elsewhere: a change is to be seen soon after it.
-        late = len(chosen) - np.array([step for step in (8, 16, 32, 64, 128) if 16 * step < 2 * len(chosen)], np.int64)
-        starts = np.unique(np.concatenate([len(chosen) * np.arange(1, PIECES) // PIECES, late]))
         heads = np.array(self._heads[: len(targets)], np.float64)
         rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
         left = targets - heads @ self._guess - (rows * self._regression.weights[chosen]).sum(axis=1)
-        # A success rate near 1 varies less than others: a policy is measured by its own noise, where that is more than the others'.
-        noise, tried = self._regression.noise, np.bincount(chosen, minlength=len(self._counts))
-        own = (NOISE_WEIGHT * noise + np.bincount(chosen, left**2, len(self._counts))) / (NOISE_WEIGHT + tried)
-        left /= np.sqrt(np.maximum(own, noise))[chosen]
-        piece = np.searchsorted(starts, np.arange(len(chosen)), side="right")
-        counts, sums = np.zeros((2, len(starts) + 1, len(self._counts)))
-        np.add.at(counts, (piece, chosen), 1.0)
-        np.add.at(sums, (piece, chosen), left)
-        counts, sums = counts.cumsum(axis=0), sums.cumsum(axis=0)
-        before, after = _evidence(counts[:-1], sums[:-1]), _evidence(counts[-1] - counts[:-1], sums[-1] - sums[:-1])
-        ahead = before + after - _evidence(counts[-1:], sums[-1:])
-        most = float(ahead.max())
-        return int(starts[ahead.argmax()]) if most + math.log(np.exp(ahead - most).mean()) > math.log(self._prior.alarm) else 0
+        return change_point(left, chosen, len(self._counts), self._regression.noise, self._prior.alarm)
 
     def _regress(self, contexts: Array, chosen: NDArray[np.int64], targets: Array) -> tuple[float, float, SharedRegression]:
         """Evidence for the features that there are now, how much they matter by it, and the regression on them."""
@@ -418,11 +395,6 @@ class BayesianSelector(SelectorBase):
         self._view = state.get("view", 0)
         self._features.load(_part(state, "features."))
         self._known, self._seen, self._transformed = len(self._targets), None, None
-
-
-def _evidence(counts: Array, sums: Array) -> Array:
-    """Log probability (n,) of numbers of variance 1 and means of prior variance 1, over that with means of 0, from counts and sums (n, P)."""
-    return np.asarray((0.5 * (sums**2 / (counts + 1.0) - np.log(counts + 1.0))).sum(axis=1), np.float64)
 
 
 def _part(state: State, prefix: str) -> State:
