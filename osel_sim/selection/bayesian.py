@@ -239,8 +239,7 @@ class BayesianSelector(SelectorBase):
 
     def _look(self, count: int) -> None:
         """Forget what was before a change that showed itself since the last fit."""
-        seen = np.array(self._contexts, np.float64), np.array(self._chosen, np.int64), self._standard(np.array(self._targets))
-        if change := self._change(*seen):
+        if change := self._change(np.array(self._contexts, np.float64), np.array(self._chosen), self._standard(np.array(self._targets))):
             self._forget(count, change)
 
     def _forget(self, count: int, change: int) -> None:
