@@ -168,6 +168,7 @@ class LiveRun:
         choice = self.selector.select(context)
         for subscriber in self.subscribers:
             subscriber.on_choice(index, choice.policy)
+        self.drivers.trust(choice.propensities)
         outcome = self._episode(index, instance, start, choice.policy, chosen=True)
         decision = self._decision(index, instance, choice, outcome, start.scene if self._tells_scenes else None)
         # What a suite or a selector of others got wrong is told now, not when the journal is read.

@@ -135,10 +135,16 @@ class _Tally:
     calls: int = 0
     actions: int = 0
     megabytes: float = 0.0
+    paid: float = 0.0  # what calls cost beyond the file's price
+    paid_per_action: float = 0.0  # the same for an action of the last answer
 
     @property
     def price(self) -> float:
-        return self.spec.price.of(self.actions, self.calls, self.megabytes)
+        return self.spec.price.of(self.actions, self.calls, self.megabytes) + self.paid
+
+    def made(self, actions: int) -> None:
+        self.actions += actions
+        self.paid += actions * self.paid_per_action
 
 
 class _Noise:
@@ -191,6 +197,7 @@ class _Episode:
             made = self._wait(delay_steps(call, spec.is_remote, self.spec.control_hz), rest if finish_chunk else rest[:0])
             if call.actions is None:
                 return call.failure
+            self.tallies[-1].paid_per_action = call.paid_per_action  # only now: what was made while waiting is of the answer before
             stop = max(made, spec.execute)
             self._make(call.actions[made:stop])
             rest = call.actions[stop:]
@@ -214,6 +221,7 @@ class _Episode:
     def _count(self, call: Call) -> None:
         self.tallies[-1].calls += call.sent
         self.tallies[-1].megabytes += call.megabytes
+        self.tallies[-1].paid += call.paid
         self.upload += call.upload
         self.inference += call.inference
         self.download += call.download
@@ -230,14 +238,14 @@ class _Episode:
         unseen = len(actions) - (self.history.length - 1)
         if self.chunked is not None and unseen > 1 and not self.env.done:
             made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions[:unseen]]))
-            self.tallies[-1].actions += made
+            self.tallies[-1].made(made)
             return made if made < unseen or unseen == len(actions) else made + self._make(actions[unseen:])
         for made, action in enumerate(actions):
             if self.env.done:
                 return made
             self._remember(len(actions) - made)
             self.env.advance(self.noise(action))
-            self.tallies[-1].actions += 1
+            self.tallies[-1].made(1)
             self._stepped(waiting=False)
         return len(actions)
 
