@@ -7,17 +7,18 @@ The instances, the noise on actions and the policies are those of `assets/logs/s
 """
 
 import argparse
-import math
 from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 
-from osel_sim.analysis.log import LoggedOutcomes, read_log
+from osel_sim.analysis.log import read_log
 from osel_sim.core.content import root
 from osel_sim.core.progress import progress
 from osel_sim.formats.merged_policy import part_names
-from osel_sim.selection.reward import PRESETS
+from osel_sim.formats.shards import Shards
+from osel_sim.interface.outcome import credited
+from osel_sim.selection.reward import PRESETS, row_rewards
 from osel_sim.statistics.intervals import bootstrap_mean_interval
 
 LOG = root() / "assets" / "logs" / "suite"
@@ -66,16 +67,39 @@ def record(out: Path, seeds: int, workers: int) -> None:
 
 
 def table(out: Path) -> None:
-    """Print, by merge, what it came to against each of its parts on the instances that were recorded, and where it beats the better one."""
-    from osel_sim.formats.rollout_log import Row
-    from osel_sim.formats.shards import Shards
-
+    """Print in Markdown what each merge came to on the instances that were recorded, against its parts on the very same."""
     log = read_log(LOG)
-    weights = PRESETS["openx"]
-    own = [row for rows in Shards(out).rows.values() for row in rows.values()]
+    weights = PRESETS["oxe"]
+    recorded = [row for rows in Shards(out).rows.values() for row in rows.values() if row.error is None]
+    at = {instance.key: number for number, instance in enumerate(log.instances)}
+    rewards = log.rewards(weights)[:, :, 0]
+    print("| merge | episodes | its success | better part | its success | reward | reward of the better part | difference [95%] | cents |")
+    print("|---|---:|---:|---|---:|---:|---:|---:|---:|")
     for merge in MERGES:
-        rows = {row.instance: row for row in own if row.policy == merge and row.error is None}
-        _print_merge(merge, rows, log, weights)
+        for task in (None, *sorted({row.task for row in recorded})):
+            rows = [row for row in recorded if row.policy == merge and task in (None, row.task)]
+            index = np.array([at[row.instance] for row in rows], np.int64)
+            columns = [log.policies.index(part) for part in part_names(merge)]
+            known = np.isfinite(rewards[np.ix_(index, columns)]).all(axis=1) if rows else np.zeros(0, bool)
+            if not known.any():
+                continue
+            rows, index = [row for row, use in zip(rows, known, strict=True) if use], index[known]
+            own = row_rewards(rows, weights)
+            better = max(columns, key=lambda column: float(rewards[index, column].mean()))
+            apart = own - rewards[index, better]
+            low, high = bootstrap_mean_interval(apart)
+            cells = (
+                merge if task is None else f"· {task}",
+                f"{len(rows)}",
+                f"{100 * np.mean([credited(row, 'success') for row in rows]):.0f}%",
+                log.policies[better],
+                f"{100 * log.success[index, better, 0].mean():.0f}%",
+                f"{own.mean():.3f}",
+                f"{rewards[index, better].mean():.3f}",
+                f"{apart.mean():+.3f} [{low:+.3f}, {high:+.3f}]",
+                f"{np.mean([row.price for row in rows]):.1f}",
+            )
+            print(f"| {' | '.join(cells)} |")
 
 
 if __name__ == "__main__":

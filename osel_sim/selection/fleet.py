@@ -9,8 +9,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
+import numpy as np
+
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.selector import Choice, Context, Selector, Shares, State
+
+
+def robot_seed(seed: int, robot: int) -> int:
+    """Seed of a robot's selector, in [0, 2**32): robots must not draw alike."""
+    return int(np.random.SeedSequence([seed, robot]).generate_state(1)[0])
+
 
 ROBOT = "robot"
 """How the names of a robot's values begin in a fleet's state: `robot0.`."""
@@ -68,6 +76,12 @@ class Fleet:
         self._rounds = 0
         self._decided: list[tuple[int, Context, Choice, float]] = []  # in this round, not yet learned from
         self._under_way: list[tuple[int, list[State]]] = []  # from which round on it is known, what was shared
+        self._messages, self._bytes = 0, 0
+
+    @property
+    def message_bytes(self) -> float:
+        """Mean size of the messages so far: that of their arrays, and 8 for every other value."""
+        return self._bytes / max(1, self._messages)
 
     def begin(self) -> None:
         """Begin to share, once all selectors were shown what they are to know beforehand."""
@@ -95,7 +109,10 @@ class Fleet:
         if self.sharing.every is None:
             return
         if self._rounds % self.sharing.every == 0:
-            self._under_way.append((self._rounds + self.sharing.delay, [member.share() for member in self._members()]))
+            messages = [member.share() for member in self._members()]
+            self._under_way.append((self._rounds + self.sharing.delay, messages))
+            self._messages += len(messages)
+            self._bytes += sum(value.nbytes if isinstance(value, np.ndarray) else 8 for message in messages for value in message.values())
         while self._under_way and self._under_way[0][0] <= self._rounds:
             _, messages = self._under_way.pop(0)
             for robot, member in enumerate(self._members()):

@@ -1,0 +1,77 @@
+"""Several robots in a replay and in a run: what is asked of them, checked."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from osel_sim.api.robot_settings import RobotSettings
+from osel_sim.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from osel_sim.analysis.engine import Setup
+    from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.analysis.sharing import Robots
+    from osel_sim.api.replay import ReplayConfig
+    from osel_sim.interface.selector import SelectorFactory
+    from osel_sim.selection.fleet import Sharing
+
+SHARE = "every:20"
+"""How several robots share unless it is said."""
+
+
+def sharing_asked(config: RobotSettings) -> "Sharing | None":
+    """What robots share; None where there is but one.
+
+    Raises:
+        UsageError: something is said of several robots and there is one, or `share` is none of what it may be.
+    """
+    from osel_sim.selection.fleet import Sharing
+
+    if config.robots == 1:
+        for name in ("share", "share_delay", "robots_by"):
+            if getattr(config, name):
+                raise UsageError(f"--{name.replace('_', '-')} is for several robots; say how many with --robots")
+        return None
+    return Sharing.parse(config.share or SHARE, config.share_delay)
+
+
+def robots_asked(config: RobotSettings, selectors: Sequence[str], named: bool, own: Collection[str] = ()) -> "tuple[list[str], Robots] | None":
+    """Selectors that are replayed to several robots, and what those share; None where there is one robot.
+
+    Args:
+        selectors: all that are replayed.
+        named: whether they were named: then all of them must be able to share.
+        own: those that are none of the registry's.
+
+    Raises:
+        UsageError: a selector that was named cannot share, or as `sharing_asked`.
+    """
+    from osel_sim.analysis.engine import WARM
+    from osel_sim.analysis.sharing import SOON, Robots
+    from osel_sim.selection.registry import check_can_share
+
+    sharing = sharing_asked(config)
+    if sharing is None:
+        return None
+    wanted = [name for name in selectors if name != "random" and (named or name in own or name.removesuffix(WARM) in SOON)]
+    check_can_share([name.removesuffix(WARM) for name in wanted if name not in own])
+    if not wanted:
+        raise UsageError("--robots: name a selector that learns, such as --selectors auto")
+    return wanted, Robots(config.robots, sharing, config.robots_by)
+
+
+def replay_robots(
+    log: "LoggedOutcomes",
+    setup: "Setup",
+    selectors: Sequence[str],
+    robots: "Robots",
+    config: "ReplayConfig",
+    factories: "Mapping[str, SelectorFactory]",
+) -> dict[str, Any]:
+    """Replay a log to several robots, with a progress bar: what `replay.json` has as `sharing`."""
+    from osel_sim.analysis.sharing import share_log, share_total
+    from osel_sim.core.progress import progress
+
+    seeds = range(config.seeds)
+    total = share_total(robots, selectors, config.seeds, config.decisions or len(log))
+    with progress(total, "decision of robots", scale=True) as bar:
+        return share_log(log, setup, selectors, robots, seeds, config.decisions, config.workers, bar.update, factories)
