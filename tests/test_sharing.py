@@ -22,8 +22,12 @@ def _stream(seed: int = 0):
     return contexts, rewards
 
 
-def _fleet(name: str, share: str, delay: int = 0, **settings: object) -> Fleet:
-    fleet = Fleet(lambda robot: make_selector(name, POLICIES, WIDTH, 7 + robot, **settings), ROBOTS, Sharing.parse(share, delay))
+def _unbegun(name: str, share: str, delay: int = 0, **settings: object) -> Fleet:
+    return Fleet(lambda robot: make_selector(name, POLICIES, WIDTH, 7 + robot, **settings), ROBOTS, Sharing.parse(share, delay))
+
+
+def _fleet(name: str, share: str, delay: int = 0) -> Fleet:
+    fleet = _unbegun(name, share, delay)
     fleet.begin()
     return fleet
 
@@ -47,7 +51,7 @@ def test_linucb_makes_the_very_same_choices_as_one_that_sees_everything() -> Non
     contexts, rewards = _stream(1)
     chosen = {}
     for share in ("every:1", "all", "none"):
-        stream = InTurn(_fleet("linucb", share, expected_costs={"a": 0.0, "b": 0.01, "c": 0.02}))  # without, it draws from equals at first
+        stream = InTurn(_unbegun("linucb", share, expected_costs={"a": 0.0, "b": 0.01, "c": 0.02}))  # without, it draws from equals at first
         chosen[share] = []
         for step in range(ROUNDS):
             for robot in range(ROBOTS):

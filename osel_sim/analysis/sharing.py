@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.dealing import By, deal, groups
 from osel_sim.analysis.engine import WARM, Setup, one_thread, one_thread_worker
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.streams import Streams, draw_streams
@@ -17,6 +16,7 @@ from osel_sim.analysis.warm_start import show
 from osel_sim.core.errors import WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.interface.selector import Selector, SelectorFactory
+from osel_sim.selection.dealing import By, deal, groups
 from osel_sim.selection.fleet import Fleet, Sharing, robot_seed
 from osel_sim.statistics.intervals import bootstrap_mean_interval
 

@@ -1,6 +1,6 @@
 """Several robots in a replay and in a run: what is asked of them, checked."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from osel_sim.api.robot_settings import RobotSettings
@@ -11,7 +11,9 @@ if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.analysis.sharing import Robots
     from osel_sim.api.replay import ReplayConfig
-    from osel_sim.interface.selector import SelectorFactory
+    from osel_sim.api.run_settings import RunConfig
+    from osel_sim.interface.selector import Selector, SelectorFactory
+    from osel_sim.interface.suite import Task
     from osel_sim.selection.fleet import Sharing
 
 SHARE = "every:20"
@@ -32,6 +34,46 @@ def sharing_asked(config: RobotSettings) -> "Sharing | None":
                 raise UsageError(f"--{name.replace('_', '-')} is for several robots; say how many with --robots")
         return None
     return Sharing.parse(config.share or SHARE, config.share_delay)
+
+
+def check_robots(config: "RunConfig", tasks: "Sequence[Task]", named: bool) -> "Sharing | None":
+    """What the robots of a live run share; None where there is but one.
+
+    Args:
+        named: whether the selector is one of the registry's.
+
+    Raises:
+        UsageError: as `sharing_asked`; the selector cannot share; or there are fewer tasks, levels or arms than robots.
+    """
+    from osel_sim.selection.dealing import robots_share
+    from osel_sim.selection.registry import check_can_share
+
+    sharing = sharing_asked(config)
+    if sharing is not None:
+        if named and sharing.every is not None:
+            check_can_share([config.selector])
+        robots_share(tasks, config.level, 0, config.robots, config.robots_by)
+    return sharing
+
+
+def fleet_said(config: RobotSettings, sharing: "Sharing | None") -> dict[str, Any]:
+    """What a run's configuration says of several robots; nothing where there is but one."""
+    if sharing is None:
+        return {}
+    return {"fleet": {"robots": config.robots, "share": str(sharing), "delay": sharing.delay, "by": config.robots_by}}
+
+
+def in_turn(config: "RunConfig", sharing: "Sharing | None", make: "Callable[..., Selector]") -> "Selector":
+    """The selector of a live run, or those of several robots as one.
+
+    Args:
+        make: makes one of a seed.
+    """
+    from osel_sim.selection.fleet import Fleet, InTurn, robot_seed
+
+    if sharing is None:
+        return make(seed=config.seed)
+    return InTurn(Fleet(lambda robot: make(seed=robot_seed(config.seed, robot)), config.robots, sharing))
 
 
 def robots_asked(config: RobotSettings, selectors: Sequence[str], named: bool, own: Collection[str] = ()) -> "tuple[list[str], Robots] | None":

@@ -5,7 +5,8 @@ import logging
 import signal
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,6 +90,7 @@ class _Run:
         watchers: "Sequence[RunSubscriber]",
     ) -> None:
         from osel_sim.api.reward import weights_of
+        from osel_sim.api.robots import check_robots
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
@@ -104,6 +106,7 @@ class _Run:
         self.everyone = with_fallbacks(self.policies, config.policies_dir)
         self.weights = weights_of(config)[0]
         self._check_selector()
+        self.sharing = check_robots(config, self.tasks, named=self.factory is None)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
@@ -189,6 +192,7 @@ class _Run:
 
     def _configuration(self) -> dict[str, Any]:
         """Everything the journal depends on but the encoder, content of files included."""
+        from osel_sim.api.robots import fleet_said
         from osel_sim.core.files import digest
         from osel_sim.formats.rollout_log import ROLLOUTS
         from osel_sim.formats.run_config import content_digests, robots_said
@@ -209,23 +213,25 @@ class _Run:
             "reward": asdict(self.weights),
             "counterfactual": config.counterfactual,
             **({"context": config.context} if config.context else {}),
+            **fleet_said(config, self.sharing),
             "content": {**content_digests(self.tasks, self.everyone), **warm},
         }
 
     def _selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
+        from osel_sim.api.robots import in_turn
         from osel_sim.context.appended import LENGTH
         from osel_sim.selection.registry import make_selector, wanted_of
 
         names = [spec.name for spec in self.policies]
         parts = (encoder.dimension, LENGTH) if self.config.context else (encoder.dimension,)
         if self.factory is not None:
-            return self.factory(names, sum(parts), self.config.seed)
+            return in_turn(self.config, self.sharing, partial(self.factory, names, sum(parts)))
         known = _declared(self.config, self.tasks, self.policies, self.weights, encoder)
         if "skills" in known:
             configuration["skills"] = known["skills"].digest if known["skills"] is not None else None
         if len(parts) > 1:
             known |= wanted_of(self.config.selector, {"parts": parts})
-        return make_selector(self.config.selector, names, sum(parts), self.config.seed, **known)
+        return in_turn(self.config, self.sharing, partial(make_selector, self.config.selector, names, sum(parts), **known))
 
     def _log(self, folder: Path, encoder: str) -> "LoggedOutcomes":
         """The rollout log of a warm start."""
@@ -241,6 +247,7 @@ class _Run:
         options = LiveOptions(
             config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context
         )
+        options = replace(options, robots=config.robots, robots_by=config.robots_by)
         return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder))
 
     def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
@@ -267,12 +274,14 @@ class _Run:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
         from osel_sim.analysis.warm_start import WarmStart, show
         from osel_sim.api.run_resume import check_still_unseen
+        from osel_sim.selection.fleet import members
 
         own = live.instance_keys(self.config.episodes)
         if self.grown_from is not None:
             check_still_unseen(own - live.instance_keys(self.grown_from), log.keys, log.source, self.config.episodes)
         log = log.take([row for row, key in enumerate(log.keys) if key not in own])
-        count = show(live.selector, WarmStart(log.contexts, log.rewards(self.weights)), live.selector.policies, self.config.seed)
+        for selector in members(live.selector):
+            count = show(selector, WarmStart(log.contexts, log.rewards(self.weights)), selector.policies, self.config.seed)
         logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
 
     def _finish(self, live: "LiveRun", interrupted: bool) -> RunResult:

@@ -37,6 +37,7 @@ from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.selector import Choice, Selector
 from osel_sim.interface.suite import Task
+from osel_sim.selection.dealing import By, robots_share
 from osel_sim.selection.reward import RewardWeights, check_reward, reward
 from osel_sim.suites.open_tasks import OpenTasks
 
@@ -52,6 +53,8 @@ class LiveOptions:
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
         context: `task` appends the task's name to the contexts that the selector is shown.
+        robots: how many take turns, decision by decision.
+        robots_by: what their instances differ in (`osel_sim.selection.dealing`); None: nothing.
     """
 
     seed: int
@@ -62,6 +65,8 @@ class LiveOptions:
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
     context: str | None = None
+    robots: int = 1
+    robots_by: By | None = None
 
 
 class LiveRun:
@@ -213,8 +218,9 @@ class LiveRun:
     def _instance(self, index: int) -> Instance:
         options = self.options
         chance = np.random.default_rng([options.seed, index])
-        task = self.tasks[int(chance.integers(len(self.tasks)))]
-        level = options.levels[int(chance.integers(len(options.levels)))]
+        tasks, levels = robots_share(self.tasks, options.levels, index % options.robots, options.robots, options.robots_by)
+        task = tasks[int(chance.integers(len(tasks)))]
+        level = levels[int(chance.integers(len(levels)))]
         return task.instance(options.seed * SEEDS_PER_RUN + index, level, options.split, options.axes)
 
     def _check(self, decision: Decision, instance: Instance) -> None:

@@ -125,25 +125,27 @@ class Fleet:
         return cast("list[Shares]", self.selectors)
 
 
+def members(selector: Selector) -> list[Selector]:
+    """The different selectors of a fleet; of any other selector, itself."""
+    return list(dict.fromkeys(selector.fleet.selectors)) if isinstance(selector, InTurn) else [selector]
+
+
 class InTurn:
     """A fleet as one selector of a stream in which robots take turns: decision t is robot t mod R's.
 
     Args:
-        fleet: begun.
+        fleet: begun with the first decision: what its selectors were shown before is common knowledge.
     """
 
     def __init__(self, fleet: Fleet) -> None:
-        self.fleet, self._decisions = fleet, 0
-
-    @property
-    def policies(self) -> tuple[str, ...]:
-        """The same for all robots."""
-        return self.fleet.selectors[0].policies
+        self.fleet, self.policies, self._decisions = fleet, fleet.selectors[0].policies, 0
 
     def select(self, context: Context) -> Choice:
         """What the robot whose turn it is chooses. Before the first of a round what the last one taught is learned."""
         robot = self._decisions % self.fleet.robots
-        if robot == 0 and self._decisions:
+        if self._decisions == 0:
+            self.fleet.begin()
+        elif robot == 0:
             self.fleet.end_round()
         self._decisions += 1
         return self.fleet.select(robot, context)
@@ -154,8 +156,7 @@ class InTurn:
 
     def state_dict(self) -> State:
         """The robots' states, `robot0.` and so on before the names; what one selector knows for all is there once."""
-        members = self.fleet.selectors[:1] if self.fleet.sharing.central else self.fleet.selectors
-        states = {f"{ROBOT}{number}.{key}": value for number, member in enumerate(members) for key, value in member.state_dict().items()}
+        states = {f"{ROBOT}{number}.{key}": value for number, one in enumerate(members(self)) for key, value in one.state_dict().items()}
         return {"selector": "fleet", "robots": self.fleet.robots, "share": str(self.fleet.sharing), "decisions": self._decisions, **states}
 
     def load_state_dict(self, state: State) -> None:
@@ -164,5 +165,6 @@ class InTurn:
 
     def add_policy(self, name: str) -> None:
         """Make one more policy available to all robots."""
-        for selector in dict.fromkeys(self.fleet.selectors):
+        for selector in members(self):
             selector.add_policy(name)
+        self.policies = self.fleet.selectors[0].policies

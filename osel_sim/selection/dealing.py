@@ -1,7 +1,7 @@
-"""Which robot decides on which instances of a stream."""
+"""Which robot decides on which instances."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,36 @@ def groups(values: Sequence[object], robots: int, by: By) -> dict[object, int]:
         known = ", ".join("unknown" if value is None else str(value) for value in different)
         raise UsageError(f"--robots {robots} --robots-by {by}: there {'is' if len(different) == 1 else 'are'} only {len(different)} ({known})")
     return {value: number % robots for number, value in enumerate(different)}
+
+
+class HasArm(Protocol):
+    """A task, and the arm that does it."""
+
+    @property
+    def name(self) -> str:
+        """Name of the task."""
+        ...
+
+    @property
+    def robot(self) -> str:
+        """Name of the arm."""
+        ...
+
+
+def robots_share[T: HasArm](tasks: Sequence[T], levels: Sequence[int], robot: int, robots: int, by: By | None) -> tuple[Sequence[T], Sequence[int]]:
+    """Tasks and levels of which a robot's instances are drawn: all, or of what they differ in its own part.
+
+    Raises:
+        UsageError: as `groups`.
+    """
+    if by is None:
+        return tasks, levels
+    if by == "level":
+        owner = groups(levels, robots, by)
+        return tasks, [level for level in levels if owner[level] == robot]
+    values = [task.name if by == "task" else task.robot for task in tasks]
+    owner = groups(values, robots, by)
+    return [task for task, value in zip(tasks, values, strict=True) if owner[value] == robot], levels
 
 
 def deal(owners: NDArray[np.int64] | None, order: NDArray[np.int32], robots: int) -> NDArray[np.int64]:
