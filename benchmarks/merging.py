@@ -50,6 +50,7 @@ def record(out: Path, seeds: int, workers: int) -> None:
         encoder="osel_small",
         action_noise=began["action_noise"],
     )
+    out.mkdir(parents=True, exist_ok=True)
     choosing = {instance.key for instance in log.instances if instance.half == "choose"}
     recording = Recording(out, plan, load_encoder(plan.encoder).identity)
     recording.keep_to(choosing & plan.instances.keys())

@@ -29,6 +29,7 @@ class EpsilonGreedySelector(SharedMeans, SelectorBase):
     """
 
     name: ClassVar[str] = "epsilon_greedy"
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, *, gap: float = 0.01) -> None:
         super().__init__(policies, context_dim, seed)
@@ -51,7 +52,7 @@ class EpsilonGreedySelector(SharedMeans, SelectorBase):
         return min(1.0, len(self.policies) / ((self._decisions + 1) * self.gap))
 
     def _select(self, context: Context) -> Choice:
-        estimates = np.where(self._counts > 0, self._means, np.inf)
+        estimates = np.where(self._counts > 0, self._means, np.inf)[self.columns]
         best = estimates == estimates.max()
         propensities = self.epsilon / len(self.policies) + (1.0 - self.epsilon) * best / best.sum()
         index = self._generator.choice(len(self.policies), p=propensities)
@@ -59,7 +60,7 @@ class EpsilonGreedySelector(SharedMeans, SelectorBase):
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
-        index = self.policies.index(choice.policy)
+        index = self.known.index(choice.policy)
         self._counts[index] += 1
         self._means[index] += (reward - self._means[index]) / self._counts[index]
         self._note(index, reward)
@@ -69,6 +70,8 @@ class EpsilonGreedySelector(SharedMeans, SelectorBase):
         self._decisions += int(message["counts"].sum())
 
     def _add_policy(self, name: str) -> None:
+        if name in self.known:
+            return
         self._counts = np.append(self._counts, 0)
         self._means = np.append(self._means, 0.0)
 

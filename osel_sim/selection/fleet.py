@@ -137,6 +137,8 @@ class InTurn:
         fleet: begun with the first decision: what its selectors were shown before is common knowledge.
     """
 
+    name = "several robots"
+
     def __init__(self, fleet: Fleet) -> None:
         self.fleet, self.policies, self._decisions = fleet, fleet.selectors[0].policies, 0
 
@@ -164,7 +166,5 @@ class InTurn:
         raise UsageError("the state of robots that share is not loaded: what is under way between them is not in it; a run learns from its journal")
 
     def add_policy(self, name: str) -> None:
-        """Make one more policy available to all robots."""
-        for selector in members(self):
-            selector.add_policy(name)
-        self.policies = self.fleet.selectors[0].policies
+        """Refused: what is under way between robots is of the policies that there were."""
+        raise UsageError(f"policy {name!r} cannot join: policies of several robots do not come and go")
