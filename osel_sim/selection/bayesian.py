@@ -14,7 +14,7 @@ from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.features import Array, Features, Part, Sketch, warm_table
 from osel_sim.selection.regression import NOISE_WEIGHT, Moments, SharedRegression, fit
-from osel_sim.selection.shared_rows import FRESH, Rows
+from osel_sim.selection.shared_rows import SharedRows, part_of
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, UNKNOWN, Skills
 from osel_sim.statistics.best import probability_of_best
 
@@ -98,7 +98,7 @@ class Prior:
         return {**lists, **weights, **parts, **alarm}
 
 
-class BayesianSelector(SelectorBase):
+class BayesianSelector(SharedRows, SelectorBase):
     """Regresses reward plus declared cost on features of the context and chooses by mean, uncertainty and chance.
 
     Model: reward + cost = mean of all + mean of the policy + (shared + own of the policy) . features + noise, all Gaussian
@@ -117,9 +117,6 @@ class BayesianSelector(SelectorBase):
     again on them; in between it is updated decision by decision. Where a context has two parts, features of the first, of both and of the second are
     fitted, and those of the highest evidence kept until the next time. Then, too, it is asked whether some policy has become better or worse; if the
     evidence says so, the decisions before are forgotten (see `alarm` in `Prior`).
-
-    Robots share their decisions as the regression sees them, from which each computes what one that saw everything would (`Rows` says what is sent
-    and how large it is). How far the context matters, which features are used and what was forgotten follow from them on every robot alike.
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
@@ -158,7 +155,6 @@ class BayesianSelector(SelectorBase):
         self._chosen: list[int] = []
         self._targets: list[float] = []
         self._counts = np.zeros(len(self.policies), np.int64)
-        self._fresh: Rows | None = None  # of its own decisions since the last exchange; None where it does not share
         self._known, self._next_fit = 0, 1
         self._seen: tuple[Context, NDArray[np.float32], Array] | None = None
         self._transformed: tuple[NDArray[np.float32], Array] | None = None
@@ -213,40 +209,7 @@ class BayesianSelector(SelectorBase):
         self._chosen.append(index)
         self._counts[index] += 1
         self._targets.append(float(reward + self._costs[index]))
-        if self._fresh is not None:
-            self._fresh.add(sketched, self._heads[-1], index, self._targets[-1])
-
-    def begin(self, first: State | None) -> State:
-        """Nothing is needed to begin alike: see `Rows`."""
-        self._fresh = Rows()
-        return {}
-
-    def share(self) -> State:
-        """Its decisions since the last call, as `Rows` says."""
-        message = (self._fresh or Rows()).message(self._sketch.dim, len(self._guess))
-        self._fresh = Rows()
-        return message
-
-    def absorb(self, messages: Sequence[State], own: int) -> None:
-        """Learn from the others' decisions as from its own. Where nothing was learned since, all stand in the order of the robots, so that each
-        comes to the very same numbers."""
-        rows = [Rows.of(message) for message in messages]
-        mine = len(rows[own].chosen)
-        if mine and self._known <= len(self._chosen) - mine and self._chosen[-mine:] == rows[own].chosen and not self._newer():
-            for seen in (self._contexts, self._heads, self._chosen, self._targets):
-                del seen[-mine:]
-        else:
-            rows[own] = Rows()
-        for row in rows:
-            self._contexts += row.contexts
-            self._heads += row.heads
-            self._chosen += row.chosen
-            self._targets += row.targets
-        self._counts = np.bincount(np.array(self._chosen, np.int64), minlength=len(self._costs))
-
-    def _newer(self) -> bool:
-        """Whether it decided since it last shared."""
-        return self._fresh is not None and bool(self._fresh.chosen)
+        self._note()
 
     def _catch_up(self) -> None:
         """Learn from what came since the last choice. Of several fits that are due only the last is computed, as nothing is left of those before: a
@@ -413,7 +376,7 @@ class BayesianSelector(SelectorBase):
             **({"view": self._view} if self._prior.parts else {}),
             "model": [self._centre, self._deviation, self._signal, self._next_fit],
             "random": self._generator.bit_generator.state,
-            **(self._fresh.state(self._sketch.dim, len(self._guess)) if self._fresh is not None else {}),
+            **self._fresh_state(),
             **{f"regression.{key}": value for key, value in self._regression.state().items()},
             **{f"features.{key}": value for key, value in self._features.state().items()},
         }
@@ -424,17 +387,13 @@ class BayesianSelector(SelectorBase):
         self._counts = np.bincount(state["chosen"], minlength=len(self._costs))
         self._centre, self._deviation, self._signal, self._next_fit = state["model"]
         self._generator.bit_generator.state = state["random"]
-        self._regression = SharedRegression(**{key: copy(value) for key, value in _part(state, "regression.").items()})
+        self._regression = SharedRegression(**{key: copy(value) for key, value in part_of(state, "regression.").items()})
         self._view = state.get("view", 0)
-        self._features.load(_part(state, "features."))
+        self._features.load(part_of(state, "features."))
         self._known, self._seen, self._transformed = len(self._targets), None, None
-        self._fresh = Rows.of(_part(state, FRESH)) if f"{FRESH}chosen" in state else None
+        self._load_fresh(state)
 
 
 def _evidence(counts: Array, sums: Array) -> Array:
     """Log probability (n,) of numbers of variance 1 and means of prior variance 1, over that with means of 0, from counts and sums (n, P)."""
     return np.asarray((0.5 * (sums**2 / (counts + 1.0) - np.log(counts + 1.0))).sum(axis=1), np.float64)
-
-
-def _part(state: State, prefix: str) -> State:
-    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
