@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.episodes.loop import Driver
+from osel_sim.episodes.driver import Driver
 from osel_sim.formats.merged_policy import MergedSpec
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.call import Call, Privileged
