@@ -15,6 +15,7 @@ from osel_sim.api.results import RecordResult
 from osel_sim.api.until_decided import baseline_then, concluded, instances_of, said, stopping
 from osel_sim.core.errors import DataError, SettingError
 from osel_sim.core.trust import trusting
+from osel_sim.formats.merged_policy import with_parts
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
@@ -253,7 +254,7 @@ def _as_it_began(configuration: Mapping[str, Any], before: Mapping[str, Any]) ->
     """
     known = dict(configuration)
     policies, content_then = before.get("policies", []), before.get("content", {})
-    added = set(configuration["policies"]) - set(policies)
+    added = with_parts(configuration["policies"]) - set(policies)
     if added and set(policies) < set(configuration["policies"]):
         digests = {key: value for key, value in configuration["content"].items() if key in content_then or key.partition(" ")[2] not in added}
         known |= {"policies": policies, "content": digests}

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from osel_sim.analysis.frontier import FrontierPlan
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.analysis.sharing import Robots
     from osel_sim.analysis.targets import Target
     from osel_sim.interface.selector import SelectorFactory
     from osel_sim.selection.reward import RewardWeights
@@ -68,6 +69,8 @@ def replay(
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
     if has_moments(config.log):
+        if config.robots > 1:
+            raise SettingError("robots", f"{config.log} is a table of moments, of which monitors learn; leave the flag out")
         return replay_moments(config)
     if config.monitors:
         raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
@@ -100,6 +103,7 @@ class _Replay:
             if name not in selectors or name == "random":
                 raise UnknownNameError("selector", name, set(selectors) - {"random"}, "--route-with names selectors that are replayed")
         check_replay_folder(folder, config.overwrite)
+        self._robots(selectors)  # refuses what cannot be, before anything is read
         if not is_live_run(config.log):
             log = read_log(config.log, None if config.encoder == AUTO else config.encoder)
             weights, preset = weights_of(config, log.metadata)
@@ -119,6 +123,8 @@ class _Replay:
         check_budget(config, live.has_all_outcomes(weights))
         if live.has_all_outcomes(weights):
             return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
+        if config.robots > 1:
+            raise UsageError(f"--robots {config.robots} needs the outcomes of every policy, and {config.log} has only those of what was chosen")
         write_off_policy(folder, found)
         return self._tell(ReplayResult(folder, off_policy=found), config.log, True)
 
@@ -137,10 +143,11 @@ class _Replay:
         from osel_sim.analysis.result import Question, build, tables, with_fixed
         from osel_sim.api.replay_budgets import check_budget, plan_budgets_of
         from osel_sim.api.replay_changes import changes_asked, replay_changes
+        from osel_sim.api.robots import replay_robots
         from osel_sim.core.progress import progress
-        from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
+        from osel_sim.formats.replay_result import FRONTIER, PENDING, SHARING, write_replay
 
-        config, seeds = self.config, range(self.config.seeds)
+        config, seeds, robots = self.config, range(self.config.seeds), self._robots(selectors)
         check_budget(config, True)
         if config.context:
             log = log.with_tasks()
@@ -181,11 +188,27 @@ class _Replay:
                     result |= _told(here)
                 pending = [name for name in selectors if name not in chosen]
                 pending += [FRONTIER] if plan is not None and part is not plan.part else []
+                pending += [SHARING] if robots is not None else []
                 whole = {**result, PENDING: pending} if pending else result
                 with bar.aside():
                     write_replay(config.folder, whole, choices, tables(result))
                     done = self._tell(ReplayResult(config.folder, whole, off_policy), config.folder, part is parts[0])
-        return done
+        if robots is None:
+            return done
+        named, asked = robots
+        result[SHARING] = replay_robots(log, here, named, asked, config, self.factories)
+        write_replay(config.folder, result, choices, tables(result))
+        return self._tell(ReplayResult(config.folder, result, off_policy), config.folder, False)
+
+    def _robots(self, selectors: Sequence[str]) -> "tuple[list[str], Robots] | None":
+        """Selectors of the robots, and what they share; None where there is one robot."""
+        from osel_sim.api.replay_changes import changes_asked
+        from osel_sim.api.robots import robots_asked
+
+        asked = robots_asked(self.config, selectors, named=self.config.selectors is not None, own=self.factories)
+        if asked is not None and changes_asked(self.config):
+            raise UsageError("--robots is for streams that do not change: leave out --join, --leave and --drift, or --robots")
+        return asked
 
     def _tell(self, result: ReplayResult, page_of: Path, first: bool) -> ReplayResult:
         if self.on_result is not None:
