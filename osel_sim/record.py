@@ -30,7 +30,7 @@ Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.np
 files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies, more
 repeats and an encoder given with it are added to what is there, and the log is read with the encoder given last.
 --until-decided looks after every 10 instances or more, --instances being the most; docs/compare.md says why such looks are honest.
---cluster sends the shards to Slurm or Ray, sends those that fail again (--retries), and merges them; --resume sends what is missing (docs/cluster.md)."""
+--cluster sends the shards to Slurm or Ray, those that fail again (--retries), and merges them; --resume sends what is missing (docs/cluster.md)."""
 
 
 def _execute(config: RecordConfig) -> int:
