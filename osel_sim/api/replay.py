@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 SOONEST = ("auto", "linucb")
 """Selectors that are replayed first: they take seconds where PPO takes minutes, and the verdict hardly ever changes with the others."""
 WARM_SOON = 15_000
-"""Up to so many decisions, those of all seeds, `auto:warm` is replayed with them; beyond that the first verdict would take longer than 20 s on two cores."""
+"""Up to so many decisions, those of all seeds, `auto:warm` is replayed with them; beyond that the first verdict takes longer than 20 s on two cores."""
 
 
 @settings

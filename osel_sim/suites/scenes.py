@@ -4,6 +4,7 @@ Their resets may let things come to rest, which differs between machines in the 
 """
 
 import json
+import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -35,8 +36,6 @@ def of_numbers(parts: Iterable[tuple[str, NDArray[np.float64]]], instance: Plain
 
 def mujoco_of(env: Any) -> tuple[Any, Any] | None:
     """MuJoCo's model and data within a gymnasium environment: gymnasium's own, dm_control's, robosuite's; None where there are none."""
-    import sys
-
     mujoco = sys.modules.get("mujoco")  # an environment that is simulated by it has imported it
     if mujoco is None:
         return None
