@@ -33,9 +33,7 @@ def test_a_digest_does_not_depend_on_last_bits_and_on_everything_else():
     others.append(of_mujoco(Fingerprint(model), positions, INSTANCE))
     assert len({first, *others}) == 5
     assert of_numbers([], INSTANCE) == ""
-    assert of_numbers([("agent", np.array([-0.0]))], INSTANCE) == of_numbers(
-        [("agent", np.array([0.0]))], INSTANCE
-    )
+    assert of_numbers([("agent", np.array([-0.0]))], INSTANCE) == of_numbers([("agent", np.array([0.0]))], INSTANCE)
 
 
 def test_mujoco_is_found_where_environments_keep_it():

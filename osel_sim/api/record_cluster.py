@@ -71,6 +71,8 @@ def record_on_cluster(config: RecordConfig) -> RecordResult:
         raise SettingError("shard", "does not go with --cluster, which records every shard")
     if config.until_decided:
         raise SettingError("until_decided", "does not go with --cluster: it looks at all episodes as they come")
+    if config.moments is not None:
+        raise SettingError("moments", "does not go with --cluster yet: tables of moments are not merged")
     out, parts = config.out, config.out / PARTS
     check_writable(out)
     config = _going_on(config, parts / SETTINGS) if config.resume else _new(config, out)

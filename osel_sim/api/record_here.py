@@ -8,6 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from osel_sim.api.record_moments import as_begun as moments_as_begun
+from osel_sim.api.record_moments import check_moments, cuts_of, in_blocks, said_of
 from osel_sim.api.record_settings import RecordConfig
 from osel_sim.api.results import RecordResult
 from osel_sim.api.until_decided import baseline_then, concluded, instances_of, said, stopping
@@ -55,6 +57,8 @@ def _check_stopping(config: RecordConfig) -> None:
             raise SettingError(name, "is for a recording until it is decided; add --until-decided, or leave it out")
     if config.shard is not None and config.until_decided:
         raise SettingError("shard", "does not go with --until-decided: a shard does not know what the others find")
+    if config.shard is not None and config.moments is not None:
+        raise SettingError("shard", "does not go with --moments yet: tables of moments are not merged")
     if config.baseline_policy is not None and config.baseline is None:
         raise SettingError("baseline_policy", "is a policy of --baseline; give that log, too")
 
@@ -67,6 +71,7 @@ def _record(config: RecordConfig, folder: Path, baseline: "LoggedOutcomes | None
     from osel_sim.remote.policy import check_servers
 
     plan = plan_of(config)
+    check_moments(plan)
     configuration = configuration_of(config, plan)  # refuses an unknown level or axis before anything loads
     before = read_run(folder) if config.resume and (folder / RUN).exists() else None
     stop = None
@@ -162,6 +167,7 @@ def plan_of(config: RecordConfig) -> "Plan":
         repeat_every=config.repeat_every or 1,
         axes=parse_axes(config.axis, known_axes(tasks)),
         action_noise=config.action_noise,
+        cuts=cuts_of(config),
         shard=None if config.shard is None else Shard.parse(config.shard),
     )
 
@@ -183,6 +189,7 @@ def configuration_of(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
         "action_noise": config.action_noise,
         "split": config.split,
         "content": content_digests(plan.tasks, plan.everyone),
+        **said_of(plan.cuts),
         **({} if plan.shard is None else {"shard": str(plan.shard)}),
     }
 
@@ -214,6 +221,7 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
         values["policies"] = tuple(dict.fromkeys([*began["policies"], *(config.policies or ())]))
         values["encoder"] = config.encoder or began["encoder"].partition("@")[0]
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
+        values |= moments_as_begun(config, given, began, folder / RUN)
         if "until_decided" in began:
             values |= {"until_decided": True, "baseline": config.baseline or baseline_then(run.get("settings"), folder)}
             values |= {"baseline_policy": began["until_decided"].get("baseline_policy"), "margin": began["until_decided"]["margin"]}
@@ -285,6 +293,8 @@ def _record_missing(recording: "Recording", workers: int, stop: "UntilDecided | 
     plan, missing = recording.plan, recording.missing()
     if stop is not None:
         missing = {key: missing[key] for key in stop.order if key in missing}
+    if plan.cuts is not None:
+        missing = {key: missing[key] for key in in_blocks(missing, plan)}
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
     unit = "episode" if left else "context"
     logger.info("starting %d workers: they load the encoder%s ...", workers, ", policies and servers" if left else "")

@@ -8,6 +8,7 @@ from annotated_types import Ge, Le
 from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Folder, Group, Index, InstanceSettings, Names, settings
 
 STOPPING = Group("Stopping early", 0.5)
+HANDOFFS = Group("Handing over within an episode", 0.4)
 CLUSTER = Group("On several machines", 0.7)
 
 
@@ -41,6 +42,10 @@ class RecordConfig(InstanceSettings, ContentSettings):
     """with --until-decided: log to compare with; without --task, its instances are taken"""
     baseline_policy: Annotated[str | None, STOPPING] = None
     """policy of --baseline, where that has several (default: the one that is recorded)"""
+    moments: Annotated[Count | None, HANDOFFS] = None
+    """cut every episode before every so many calls, and let every other policy drive on from there: moments.parquet, for replay (docs/moments.md)"""
+    most_moments: Annotated[Count | None, HANDOFFS] = None
+    """with --moments: cut an episode so many times at most (default: until it is over)"""
     start_seed: Annotated[Index, INSTANCES] = 0
     """seed of the first instance"""
     shard: Annotated[str | None, CLUSTER] = None

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from osel_sim.formats.policy_changes import PolicyChange
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.interface.encoder import Encoder
+    from osel_sim.interface.monitor import MonitorFactory
     from osel_sim.interface.policy import Policy
     from osel_sim.interface.selector import Selector, SelectorFactory
     from osel_sim.interface.suite import Task
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | SelectorFactory
+    MonitorLike = str | MonitorFactory
 
 logger = logging.getLogger(__name__)
 
@@ -40,6 +42,7 @@ def run(
     *,
     policies: "Sequence[str | Policy | PolicyObject] | None" = None,
     selector: "SelectorLike | None" = None,
+    monitor: "MonitorLike | None" = None,
     subscribers: "Sequence[RunSubscriber]" = (),
     **values: Any,
 ) -> RunResult:
@@ -49,6 +52,7 @@ def run(
         config: settings as one object; `values` change some of them.
         policies: names of policy files, or objects with `reset` and `act` (`osel_sim.as_policy` says what they are shown and cost).
         selector: name of a selector, or a class or function of one's own: called with the policies' names, the context's length and the seed.
+        monitor: name of a monitor, or a class or function of one's own (`osel_sim.interface.monitor.MonitorFactory`).
         subscribers: what else watches the run (`osel_sim.episodes.run_subscribers`), beside progress, timings, TensorBoard and the page.
         values: settings by name, as `RunConfig` has them.
 
@@ -65,13 +69,17 @@ def run(
     if selector is not None:
         values["selector"] = selector if isinstance(selector, str) else factory_name(selector)
         factory = None if isinstance(selector, str) else selector
+    watch = None
+    if monitor is not None:
+        values["monitor"] = monitor if isinstance(monitor, str) else factory_name(monitor)
+        watch = None if isinstance(monitor, str) else monitor
     config = RunConfig.of(**values) if config is None else config.changed(**values)
     if config.resume and not config.task and config.out is not None:
         from osel_sim.api.run_resume import settings_then
 
         config = config.of(**settings_then(config.out) | {name: getattr(config, name) for name in config.given})
     with trusting(config.trust):
-        return _Run(config, objects, factory, subscribers).execute()
+        return _Run(config, objects, factory, subscribers, watch).execute()
 
 
 class _Run:
@@ -81,6 +89,7 @@ class _Run:
         objects: policies that no file describes.
         factory: makes the selector where it is none of the registry's.
         watchers: subscribers of the caller's own.
+        monitor: makes the monitor where it is none of the registry's.
     """
 
     def __init__(
@@ -89,15 +98,17 @@ class _Run:
         objects: "Mapping[str, PolicyObject]",
         factory: "SelectorFactory | None",
         watchers: "Sequence[RunSubscriber]",
+        monitor: "MonitorFactory | None" = None,
     ) -> None:
         from osel_sim.api.reward import weights_of
         from osel_sim.api.run_changes import plan
+        from osel_sim.api.run_monitor import check_monitor
         from osel_sim.api.run_resume import policies_then
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
-        self.config, self.objects, self.factory, self.watchers = config, objects, factory, watchers
+        self.config, self.objects, self.factory, self.watchers, self.monitor = config, objects, factory, watchers, monitor
         if config.tensorboard:
             from osel_sim.episodes.tensorboard import check_installed
 
@@ -111,6 +122,7 @@ class _Run:
         self.driving = with_fallbacks(self.plan.driving, config.policies_dir) if self.plan.changes else self.everyone
         self.weights = weights_of(config)[0]
         self._check_selector()
+        check_monitor(config, monitor, self.policies)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
@@ -138,6 +150,7 @@ class _Run:
             return self._run(folder, configuration, holding)
 
     def _run(self, folder: Path, configuration: dict[str, Any], holding: contextlib.ExitStack) -> RunResult:
+        from osel_sim.api.run_monitor import start_monitor_warm
         from osel_sim.context.encoder import load_encoder
         from osel_sim.context.names import DEFAULT_ENCODER
         from osel_sim.formats.journal import JOURNAL
@@ -169,6 +182,7 @@ class _Run:
             stack.callback(live.close)
             if seen is not None:
                 self._start_warm(live, seen)
+            start_monitor_warm(config, live, self.grown_from)
             live.replay()
             self._write_changes(folder)
             if self.grown_from is not None:
@@ -197,6 +211,7 @@ class _Run:
 
     def _configuration(self) -> dict[str, Any]:
         """Everything the journal depends on but the encoder, content of files included."""
+        from osel_sim.api.run_monitor import monitor_said
         from osel_sim.core.files import digest
         from osel_sim.formats.rollout_log import ROLLOUTS
         from osel_sim.formats.run_config import content_digests, robots_said
@@ -217,6 +232,7 @@ class _Run:
             "reward": asdict(self.weights),
             "counterfactual": config.counterfactual,
             **({"context": config.context} if config.context else {}),
+            **monitor_said(config),
             "content": {**content_digests(self.tasks, self.everyone), **warm},
         }
 
@@ -267,6 +283,7 @@ class _Run:
         return log.with_tasks() if self.config.context else log
 
     def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
+        from osel_sim.api.run_monitor import make_run_monitor
         from osel_sim.episodes.live import LiveOptions, LiveRun
 
         config = self.config
@@ -274,7 +291,8 @@ class _Run:
             *(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context),
             changes=self._changes(encoder, selector),
         )
-        return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder))
+        monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
+        return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder), monitor)
 
     def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
         """What watches the run."""

@@ -112,8 +112,9 @@ class TimingFile(RunSubscriber):
 
     @override
     def watch(self, index: int, policy: str, chosen: bool) -> Sequence[Subscriber]:
-        self._episodes[policy] = Timing()
-        return [self._episodes[policy]]
+        name = policy if policy not in self._episodes else f"{policy} alone"  # once more, without the monitor
+        self._episodes[name] = Timing()
+        return [self._episodes[name]]
 
     @override
     def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:

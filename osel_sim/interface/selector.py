@@ -88,6 +88,6 @@ SelectorFactory = Callable[[Sequence[str], int, int], Selector]
 """Makes a selector of the policies' names, the length of a context and a seed: a class, or a function."""
 
 
-def factory_name(factory: SelectorFactory) -> str:
-    """What a selector that is none of the registry's is called: by its `name`, else by its class or function."""
+def factory_name(factory: Callable[..., Any]) -> str:
+    """What a selector, or a monitor, that is none of the registry's is called: by its `name`, else by its class or function."""
     return str(getattr(factory, "name", None) or getattr(factory, "__name__", type(factory).__name__))
