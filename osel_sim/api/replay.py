@@ -28,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 SOONEST = ("auto", "linucb")
 """Selectors that are replayed first: they take seconds where PPO takes minutes, and the verdict hardly ever changes with the others."""
+WARM_SOON = 15_000
+"""Up to so many decisions, those of all seeds, `auto:warm` is replayed with them; beyond it the first verdict takes more than 20 s on two cores."""
 
 
 def replay(
@@ -159,7 +161,7 @@ class _Replay:
             )
         here, question = setup(weights), Question(config.margin, config.half is not None, config.route_with)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
-        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
+        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors, len(seeds) * (config.decisions or len(log)))]
         budgets = plan_budgets_of(config, log, here, selectors)
         parts = [*stages, *([] if budgets is None else [budgets.part]), *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
@@ -287,9 +289,14 @@ class _Replay:
         return evaluate(live, weights, own)
 
 
-def _stages(selectors: Sequence[str]) -> list[list[str]]:
-    """Those that a verdict comes of soonest, and all others; where there is nothing to tell apart, all in one."""
-    first = [name for name in selectors if name in SOONEST]
+def _stages(selectors: Sequence[str], decisions: int) -> list[list[str]]:
+    """Those that a verdict comes of soonest, and all others; where there is nothing to tell apart, all in one.
+
+    Args:
+        decisions: of each selector, in all seeds.
+    """
+    soonest = (*SOONEST, "auto:warm") if decisions <= WARM_SOON else SOONEST
+    first = [name for name in selectors if name in soonest]
     return [names for names in (first, [name for name in selectors if name not in first]) if names] or [[]]
 
 
