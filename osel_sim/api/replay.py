@@ -147,7 +147,7 @@ class _Replay:
         from osel_sim.api.replay_changes import changes_asked, replay_changes
         from osel_sim.api.robots import replay_robots
         from osel_sim.core.progress import progress
-        from osel_sim.formats.replay_result import FRONTIER, PENDING, SHARING, write_replay
+        from osel_sim.formats.replay_result import BUDGET, FRONTIER, PENDING, SHARING, write_replay
 
         config, seeds, robots = self.config, range(self.config.seeds), self._robots(selectors)
         check_budget(config, True)
@@ -177,7 +177,7 @@ class _Replay:
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
                 elif budgets is not None and part is budgets.part:
-                    result["budget"] = budgets.measured(made)
+                    result[BUDGET] = budgets.measured(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}
@@ -189,6 +189,7 @@ class _Replay:
                     result["off_policy"] = off_policy
                     result |= _told(here)
                 pending = [name for name in selectors if name not in chosen]
+                pending += [BUDGET] if budgets is not None and BUDGET not in result else []
                 pending += [FRONTIER] if plan is not None and part is not plan.part else []
                 pending += [SHARING] if robots is not None else []
                 whole = {**result, PENDING: pending} if pending else result
