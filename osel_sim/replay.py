@@ -10,6 +10,7 @@ EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/pick_place                                   # every selector there is, 20 seeds
   python -m osel_sim.replay assets/logs/pick_place --selectors ppo ucb1 --preset waymo --out runs/ppo
   python -m osel_sim.replay assets/logs/suite --half score --selectors auto auto:warm   # without and with the outcomes of the other half beforehand
+  python -m osel_sim.replay assets/logs/suite --selectors auto --budget-cents 5000   # what as much money buys, at best and by auto
   python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500 --no-frontier   # a quick look
   python -m osel_sim.replay assets/logs/suite --selectors linucb --robots 4 --share every:20   # what do four robots gain by sharing?
   python -m osel_sim.replay assets/logs/suite --selectors auto linucb --join remote_large@500 --leave remote_large@1200   # a policy comes and goes
@@ -26,6 +27,8 @@ With --half a selector that learns off-policy can be shown all outcomes of the o
 A verdict comes first, from auto, linucb and the fixed policies; then all other selectors are replayed, of which the paper's PPO takes longest, and
 at last all of them at other weights of time and price, for the frontier (--no-frontier leaves that out). After each of the three what is known so far
 is written, page included with --open: Ctrl-C loses no more than what is being replayed.
+
+With --budget-cents selectors are replayed within that budget, too, and within quarters to four times of it: auto, unless --selectors names others.
 
 Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv, frontier.csv. Of a live run's folder it estimates
 what each fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes.

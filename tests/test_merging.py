@@ -10,7 +10,7 @@ from osel_sim.core.errors import ContentError, OselError, UnknownNameError, Usag
 from osel_sim.episodes.drivers import Drivers, choose_policies, with_fallbacks
 from osel_sim.episodes.expected_costs import expected_costs
 from osel_sim.episodes.loop import Driver, run_episode
-from osel_sim.episodes.merging import AGREEMENT, MergedCaller, merge_chunks
+from osel_sim.episodes.merged_caller import AGREEMENT, MergedCaller, merge_chunks
 from osel_sim.formats.library import load_policy
 from osel_sim.formats.merged_policy import MergedSpec, merged
 from osel_sim.formats.policy_file import Price, Remote

@@ -45,6 +45,10 @@ class ReplayConfig(RobotSettings, LoggedRewardSettings):
     """a gain in reward a decision that is not worth routing for"""
     route_with: Annotated[Names | None, OTHER] = None
     """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
+    budget_cents: Annotated[NonNegative | None, OTHER] = None
+    """replay within budgets, too: this one in cents, and quarters to four times of it, against the best that could be had for as much"""
+    budget_per: Annotated[Count | None, OTHER] = None
+    """with --budget-cents: a budget for each so many decisions, one after the other (default: one for the whole stream)"""
     join: Annotated[Names, OTHER] = ()
     """POLICY@DECISION: a policy that is not there before that decision of a stream; what selectors make of it is reported"""
     leave: Annotated[Names, OTHER] = ()

@@ -14,6 +14,7 @@ from osel_sim.api.settings import (
     Index,
     InstanceSettings,
     Names,
+    NonNegative,
     RewardSettings,
     settings,
 )
@@ -60,6 +61,10 @@ class RunConfig(RobotSettings, RewardSettings, InstanceSettings, ContentSettings
     """also write TensorBoard event files (needs the package tensorboard)"""
     realtime: Annotated[bool, OTHER] = False
     """sleep so that the robot moves in real time"""
+    budget_cents: Annotated[NonNegative | None, MAIN] = None
+    """never spend more cents than that: the selector spends them where they help most, and free policies take over when they are spent"""
+    budget_per: Annotated[Count | None, OTHER] = None
+    """with --budget-cents: a budget for each so many decisions, one after the other (default: one for the whole run)"""
     warm_start: Annotated[Folder | None, OTHER] = None
     """rollout log whose outcomes the selector is shown first (auto, linucb, thompson ...)"""
     monitor: Annotated[str | None, OTHER] = None

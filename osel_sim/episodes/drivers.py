@@ -9,7 +9,7 @@ from typing import Self
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError, OselError, UsageError
 from osel_sim.episodes.loop import Driver
-from osel_sim.episodes.merging import MergedCaller
+from osel_sim.episodes.merged_caller import MergedCaller
 from osel_sim.formats import library
 from osel_sim.formats.merged_policy import MergedSpec, is_merge, merged, parts_of
 from osel_sim.formats.policy_file import PolicySpec

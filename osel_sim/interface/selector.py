@@ -66,6 +66,19 @@ class Selector(Protocol):
 
 
 @runtime_checkable
+class Pays(Protocol):
+    """A selector that wants to know what its choices cost, such as one that keeps to a budget."""
+
+    def pay(self, policy: str, price: float) -> None:
+        """Told once after each choice, before `update`, and where an error leaves nothing to learn too.
+
+        Args:
+            price: cents.
+        """
+        ...
+
+
+@runtime_checkable
 class Shares(Protocol):
     """A selector that learns together with others of its kind, policies and settings, on other robots: they exchange what they learned, never images.
 

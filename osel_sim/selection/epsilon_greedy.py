@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.selector import Choice, Context, State
@@ -52,12 +53,15 @@ class EpsilonGreedySelector(SharedMeans, SelectorBase):
         return min(1.0, len(self.policies) / ((self._decisions + 1) * self.gap))
 
     def _select(self, context: Context) -> Choice:
-        estimates = np.where(self._counts > 0, self._means, np.inf)[self.columns]
+        estimates = np.where(self._counts > 0, self._means - self._charged, np.inf)[self.columns]
         best = estimates == estimates.max()
         propensities = self.epsilon / len(self.policies) + (1.0 - self.epsilon) * best / best.sum()
         index = self._generator.choice(len(self.policies), p=propensities)
         self._decisions += 1
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
+
+    def _expected(self, context: Context) -> NDArray[np.float64]:
+        return self._means.copy()
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         index = self.known.index(choice.policy)

@@ -34,7 +34,7 @@ class KernelUCBSelector(BayesianSelector):
         warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
         parts: lengths of the encoder's part of a context and of what is appended to it; which of them are used, the evidence says. Empty: one whole.
         components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
-        signals, shared, optimism, mean_optimism, chance, mean_chance, floor, alarm: see `Prior`.
+        signals, shared, optimism, mean_optimism, chance, mean_chance, floor, least, alarm: see `Prior`.
 
     Raises:
         UsageError: a number out of range, or contexts (those of the skills, too) of another form.
@@ -64,6 +64,7 @@ class KernelUCBSelector(BayesianSelector):
         chance: float = 0.1,
         mean_chance: float = 0.4,
         floor: float = 0.1,
+        least: float = 0.0,
         alarm: float = 1e4,
     ) -> None:
         if components < 1 or landmarks < 1 or not width > 0.0:
@@ -77,6 +78,7 @@ class KernelUCBSelector(BayesianSelector):
             chance=chance,
             mean_chance=mean_chance,
             floor=floor,
+            least=least,
             alarm=alarm,
             expected_costs=expected_costs,
             warm_contexts=warm_contexts,

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
@@ -37,14 +38,16 @@ class ThompsonSelector(SharedMeans, SelectorBase):
         self._squares = 0.0
 
     def _select(self, context: Context) -> Choice:
-        total = int(self._counts.sum())
-        overall = float((self._counts * self._means).sum() / total) if total else 0.0
-        noise = (1.0 + self._squares) / (1.0 + total)
-        weight = self._counts + 1.0
-        means = (self._counts * self._means + overall) / weight
-        propensities = probability_of_best(means[self.columns], np.sqrt(noise / weight)[self.columns])
+        noise = (1.0 + self._squares) / (1.0 + int(self._counts.sum()))
+        means, deviations = self._expected(context) - self._charged, np.sqrt(noise / (self._counts + 1.0))
+        propensities = probability_of_best(means[self.columns], deviations[self.columns])
         index = self._generator.choice(len(self.policies), p=propensities)
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
+
+    def _expected(self, context: Context) -> NDArray[np.float64]:
+        total = int(self._counts.sum())
+        overall = float((self._counts * self._means).sum() / total) if total else 0.0
+        return np.asarray((self._counts * self._means + overall) / (self._counts + 1.0), np.float64)
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         index = self.known.index(choice.policy)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.selector import Choice, Context, State
@@ -47,11 +48,14 @@ class UCB1Selector(SharedMeans, SelectorBase):
     def _select(self, context: Context) -> Choice:
         tried = self._counts > 0
         bonus = self.width * np.sqrt(2.0 * np.log(max(1, int(self._counts.sum()))) / np.maximum(1, self._counts))
-        index = np.where(tried, self._means + bonus, np.inf)[self.columns]
+        index = np.where(tried, self._means + bonus - self._charged, np.inf)[self.columns]
         best = index == index.max()
         propensities = best / best.sum()
         chosen = self._generator.choice(len(self.policies), p=propensities)
         return Choice(self.policies[chosen], dict(zip(self.policies, propensities.tolist(), strict=True)))
+
+    def _expected(self, context: Context) -> NDArray[np.float64]:
+        return self._means.copy()
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         index = self.known.index(choice.policy)
