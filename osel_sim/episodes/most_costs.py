@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from osel_sim.formats.merged_policy import parts_of
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
 
@@ -25,6 +26,10 @@ def most_costs(policies: Sequence[PolicySpec], everyone: Sequence[PolicySpec], h
 
 def _alone(spec: PolicySpec, horizon: int, environment: EnvironmentSpec) -> float:
     calls = math.ceil(horizon / spec.execute)
+    return sum(_asked(part, calls, horizon, environment) for part in parts_of(spec))  # of a merge all are asked, and all are paid
+
+
+def _asked(spec: PolicySpec, calls: int, horizon: int, environment: EnvironmentSpec) -> float:
     images = len(spec.cameras) * 3 * spec.image_size**2 * spec.history
     megabytes = 1e-6 * (images + 8 * environment.action.dimension * max(spec.execute, horizon) + OVERHEAD) if spec.is_remote else 0.0
     return spec.price.of(horizon, calls, calls * megabytes)
