@@ -22,6 +22,7 @@ EXAMPLES = """examples:
   python -m osel_sim.run --config runs/first/run.json --seed 1 --out runs/second   # another run with the same settings
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
+events.jsonl (policies that joined or left),
 contexts.npz, selector.safetensors, summary.json, curve.png, videos/, and report.html, the page about it, with figures/ and tables/ beside it.
 Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 
