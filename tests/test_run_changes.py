@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_helpers import POLICY, environment, make_world, wait_for_lines
+from run_helpers import environment, wait_for_lines
 
 import osel_sim
 from osel_sim.analysis.live import read_live
@@ -26,14 +26,56 @@ from osel_sim.run import main as run_main
 FIRST, SECOND, THIRD = 3, 6, 8
 
 
+POLICY = """version = 1
+name = "{name}"
+title = "test"
+location = "local"
+kind = "toy_{kind}"
+execute = 4
+inference_seconds = 0.01
+
+[observation]
+cameras = ["top"]
+image_size = 64
+"""
+
+ENCODER = """
+import numpy as np
+
+
+class Letters:
+    name = identity = "letters"
+    dimension, image_size = 26, 64
+
+    def encode(self, images, instruction):
+        return np.array([instruction.lower().count(letter) / len(instruction) for letter in "abcdefghijklmnopqrstuvwxyz"], np.float32)
+"""
+POINTS = """[osel_sim.suites]
+toy = toy_suite:Toy
+[osel_sim.policies]
+toy_greedy = toy_policies:load_greedy
+toy_reader = toy_policies:load_reader
+[osel_sim.encoders]
+letters = letters:Letters
+"""
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
+    """Two local policies of the toy suite, `calm` and `brisk`: no simulator, no server."""
+    folder = tmp_path_factory.mktemp("world")
+    plugin, info = folder / "plugin", folder / "plugin" / "toy_suite-1.0.dist-info"
+    info.mkdir(parents=True)
+    for name in ("toy_suite.py", "toy_policies.py"):
+        shutil.copy(Path(__file__).parent / "toy_suite" / name, plugin)
+    (plugin / "letters.py").write_text(ENCODER)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-suite\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(POINTS)
+    (folder / "policies").mkdir()
+    for name, kind in (("calm", "greedy"), ("brisk", "reader")):
+        (folder / "policies" / f"{name}.toml").write_text(POLICY.format(name=name, kind=kind))
     with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        text = POLICY.format(name="brisk", location="local", kind="wild", inference=0.01)  # needs no server
-        (folder / "policies" / "brisk.toml").write_text(text)
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])
+        patch.syspath_prepend(str(plugin))
         yield folder
 
 
@@ -41,7 +83,7 @@ def world(tmp_path_factory):
 def begun(world) -> Path:
     """A run of one policy, of some decisions."""
     folder = world / "begun"
-    flags = ["--task", "short", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--policies", "calm", "--encoder", "colours"]
+    flags = ["--task", "toy:reach", "--policies-dir", world / "policies", "--policies", "calm", "--encoder", "letters"]
     flags += ["--selector", "thompson", "--counterfactual", "--no-page", "--episodes", FIRST, "--out", folder]
     assert run_main(list(map(str, flags))) == 0
     return folder
@@ -64,7 +106,7 @@ def changed(world, begun) -> tuple[Path, Told]:
     shutil.copytree(begun, folder)
     osel_sim.run(out=folder, resume=True, episodes=SECOND, add_policies="brisk", no_page=True, subscribers=[told])
     shutil.copytree(folder, world / "joined")
-    osel_sim.run(out=folder, resume=True, episodes=THIRD, retire="calm", subscribers=[told])
+    osel_sim.run(out=folder, resume=True, episodes=THIRD, retire="calm", no_page=False, subscribers=[told])
     return folder, told
 
 
@@ -158,7 +200,7 @@ def test_more_that_cannot_be_changed(world, changed, tmp_path, capsys):
     joined = world / "joined"
     assert run_main(["--out", str(joined), "--resume", "--episodes", "9", "--add-policies", "brisk"]) == 2
     assert "has had it since decision 3" in capsys.readouterr().err
-    flags = ["--task", "short", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--out", tmp_path / "new"]
+    flags = ["--task", "toy:reach", "--policies-dir", world / "policies", "--out", tmp_path / "new"]
     assert run_main([*map(str, flags), "--add-policies", "brisk"]) == 2
     assert "add --resume" in capsys.readouterr().err
     file = world / "policies" / "brisk.toml"
