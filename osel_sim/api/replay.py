@@ -6,12 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from osel_sim.api.results import ReplayResult
+from osel_sim.api.replay_settings import ReplayConfig, choose_selectors
+from osel_sim.api.results import MomentsResult, ReplayResult
 from osel_sim.api.reward import weights_of
-from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, NonNegative, settings
-from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, SettingError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.encoder_choice import EncoderChoice
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from osel_sim.analysis.frontier import FrontierPlan
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.analysis.sharing import Robots
     from osel_sim.analysis.targets import Target
     from osel_sim.interface.selector import SelectorFactory
     from osel_sim.selection.reward import RewardWeights
@@ -27,61 +28,8 @@ logger = logging.getLogger(__name__)
 
 SOONEST = ("auto", "linucb")
 """Selectors that are replayed first: they take seconds where PPO takes minutes, and the verdict hardly ever changes with the others."""
-
-
-@settings
-class ReplayConfig(LoggedRewardSettings):
-    """Replay a rollout log to selectors: how far from the oracle is each, and is routing worth it?"""
-
-    log: Folder
-    """folder of a rollout log, or of a live run"""
-    selectors: Annotated[Names | None, MAIN] = None
-    """ppo, ucb1, auto ... (default: all there are)"""
-    policies: Annotated[Names | None, MAIN] = None
-    """policies to choose from (default: all of the log)"""
-    seeds: Annotated[Count, MAIN] = 20
-    """number of random orders"""
-    decisions: Annotated[Count | None, MAIN] = None
-    """length of a stream (default: all instances)"""
-    half: Annotated[Literal["choose", "score"] | None, MAIN] = None
-    """only this half of the instances: one to choose settings by, the other to report (default: all)"""
-    out: Annotated[Path | None, MAIN] = None
-    """where to write (default: runs/replay-LOG)"""
-    overwrite: Annotated[bool, MAIN] = False
-    """replace a replay that is in --out"""
-    open: Annotated[bool, MAIN] = False
-    """write its page too and show it in the browser, as soon as there is a verdict; reload it as more is replayed"""
-    workers: Annotated[Count, MAIN] = 2
-    """processes; the result does not depend on how many"""
-    unknown_costs: Annotated[bool, OTHER] = False
-    """let all selectors learn what policies cost (default: auto is told their mean cost)"""
-    unknown_skills: Annotated[bool, OTHER] = False
-    """do not tell auto what policies were made for (default: it is told what the log says of it)"""
-    no_frontier: Annotated[bool, OTHER] = False
-    """do not replay selectors at other weights of time and price as well"""
-    margin: Annotated[NonNegative, OTHER] = 0.02
-    """a gain in reward a decision that is not worth routing for"""
-    route_with: Annotated[Names | None, OTHER] = None
-    """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
-    join: Annotated[Names, OTHER] = ()
-    """POLICY@DECISION: a policy that is not there before that decision of a stream; what selectors make of it is reported"""
-    leave: Annotated[Names, OTHER] = ()
-    """POLICY@DECISION: a policy that is not there from that decision on"""
-    drift: Annotated[Names, OTHER] = ()
-    """from a decision on a price changes, price:POLICY:x2@DECISION, or a policy comes to what another of the log came to, POLICY=OTHER@DECISION"""
-    encoder: Annotated[str | None, OTHER] = None
-    """whose contexts, where the log has several, or auto: those that predict rewards best, by the choosing half (default: the one it was recorded
-    with)"""
-    targets: Annotated[Files, OTHER] = ()
-    """of a live run or logged decisions: tables of how you would choose (columns policy, probability, and decision or instance); what each would have
-    earned is estimated too"""
-    context: Annotated[Literal["task"] | None, OTHER] = None
-    """append the task's name to the contexts; auto finds out whether it helps"""
-
-    @property
-    def folder(self) -> Path:
-        """Where to write."""
-        return self.out or Path("runs") / f"replay-{self.log.resolve().name}"
+WARM_SOON = 15_000
+"""Up to so many decisions, those of all seeds, `auto:warm` is replayed with them; beyond it the first verdict takes more than 20 s on two cores."""
 
 
 def replay(
@@ -91,7 +39,7 @@ def replay(
     targets: "Mapping[str, Target] | Sequence[Path | str] | Path | str | None" = None,
     on_result: Callable[[ReplayResult], None] | None = None,
     **values: Any,
-) -> ReplayResult:
+) -> ReplayResult | MomentsResult:
     """Show a log's instances in random orders to selectors, each of which sees only the outcome of its choice.
 
     Args:
@@ -103,9 +51,13 @@ def replay(
             frontier. What is yet to come, `ReplayResult.pending` says.
         values: settings by name, as `ReplayConfig` has them.
 
+    Returns:
+        what came of it; of the folder of a table of moments (`record --moments`), monitors and start selectors compared.
+
     Raises:
         OselError: whatever is wrong with the settings or the log; the message says what.
     """
+    from osel_sim.api.replay_moments import has_moments, replay_moments
     from osel_sim.interface.selector import factory_name
 
     factories: dict[str, SelectorFactory] = {}
@@ -118,6 +70,12 @@ def replay(
     if targets is not None and not isinstance(targets, Mapping):
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
+    if has_moments(config.log):
+        if config.robots > 1:
+            raise SettingError("robots", f"{config.log} is a table of moments, of which monitors learn; leave the flag out")
+        return replay_moments(config)
+    if config.monitors:
+        raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
     return _Replay(config, factories, functions, on_result).execute()
 
 
@@ -136,6 +94,7 @@ class _Replay:
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
         from osel_sim.analysis.logged_choices import choices_of, has_choices
+        from osel_sim.api.replay_budgets import check_budget
         from osel_sim.api.replay_changes import check_all_outcomes
         from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
 
@@ -146,6 +105,7 @@ class _Replay:
             if name not in selectors or name == "random":
                 raise UnknownNameError("selector", name, set(selectors) - {"random"}, "--route-with names selectors that are replayed")
         check_replay_folder(folder, config.overwrite)
+        self._robots(selectors)  # refuses what cannot be, before anything is read
         if not is_live_run(config.log):
             log = read_log(config.log, None if config.encoder == AUTO else config.encoder)
             weights, preset = weights_of(config, log.metadata)
@@ -162,8 +122,11 @@ class _Replay:
             weights, preset = weights_of(config, recorded=live.reward)
         found = self._off_policy(live, weights)
         check_all_outcomes(config, live.has_all_outcomes(weights))
+        check_budget(config, live.has_all_outcomes(weights))
         if live.has_all_outcomes(weights):
             return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
+        if config.robots > 1:
+            raise UsageError(f"--robots {config.robots} needs the outcomes of every policy, and {config.log} has only those of what was chosen")
         write_off_policy(folder, found)
         return self._tell(ReplayResult(folder, off_policy=found), config.log, True)
 
@@ -180,11 +143,14 @@ class _Replay:
         from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import Question, build, tables, with_fixed
+        from osel_sim.api.replay_budgets import check_budget, plan_budgets_of
         from osel_sim.api.replay_changes import changes_asked, replay_changes
+        from osel_sim.api.robots import replay_robots
         from osel_sim.core.progress import progress
-        from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
+        from osel_sim.formats.replay_result import FRONTIER, PENDING, SHARING, write_replay
 
-        config, seeds = self.config, range(self.config.seeds)
+        config, seeds, robots = self.config, range(self.config.seeds), self._robots(selectors)
+        check_budget(config, True)
         if config.context:
             log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)
@@ -195,8 +161,9 @@ class _Replay:
             )
         here, question = setup(weights), Question(config.margin, config.half is not None, config.route_with)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
-        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
-        parts = [*stages, *([] if plan is None else [plan.part])]
+        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors, len(seeds) * (config.decisions or len(log)))]
+        budgets = plan_budgets_of(config, log, here, selectors)
+        parts = [*stages, *([] if budgets is None else [budgets.part]), *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
         with (
             progress(sum(part.total for part in parts), "decision", scale=True) as bar,
@@ -209,6 +176,8 @@ class _Replay:
             for part, made in zip(parts, replayed, strict=True):
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
+                elif budgets is not None and part is budgets.part:
+                    result["budget"] = budgets.measured(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}
@@ -221,11 +190,27 @@ class _Replay:
                     result |= _told(here)
                 pending = [name for name in selectors if name not in chosen]
                 pending += [FRONTIER] if plan is not None and part is not plan.part else []
+                pending += [SHARING] if robots is not None else []
                 whole = {**result, PENDING: pending} if pending else result
                 with bar.aside():
                     write_replay(config.folder, whole, choices, tables(result))
                     done = self._tell(ReplayResult(config.folder, whole, off_policy), config.folder, part is parts[0])
-        return done
+        if robots is None:
+            return done
+        named, asked = robots
+        result[SHARING] = replay_robots(log, here, named, asked, config, self.factories)
+        write_replay(config.folder, result, choices, tables(result))
+        return self._tell(ReplayResult(config.folder, result, off_policy), config.folder, False)
+
+    def _robots(self, selectors: Sequence[str]) -> "tuple[list[str], Robots] | None":
+        """Selectors of the robots, and what they share; None where there is one robot."""
+        from osel_sim.api.replay_changes import changes_asked
+        from osel_sim.api.robots import robots_asked
+
+        asked = robots_asked(self.config, selectors, named=self.config.selectors is not None, own=self.factories)
+        if asked is not None and changes_asked(self.config):
+            raise UsageError("--robots is for streams that do not change: leave out --join, --leave and --drift, or --robots")
+        return asked
 
     def _tell(self, result: ReplayResult, page_of: Path, first: bool) -> ReplayResult:
         if self.on_result is not None:
@@ -304,9 +289,14 @@ class _Replay:
         return evaluate(live, weights, own)
 
 
-def _stages(selectors: Sequence[str]) -> list[list[str]]:
-    """Those that a verdict comes of soonest, and all others; where there is nothing to tell apart, all in one."""
-    first = [name for name in selectors if name in SOONEST]
+def _stages(selectors: Sequence[str], decisions: int) -> list[list[str]]:
+    """Those that a verdict comes of soonest, and all others; where there is nothing to tell apart, all in one.
+
+    Args:
+        decisions: of each selector, in all seeds.
+    """
+    soonest = (*SOONEST, "auto:warm") if decisions <= WARM_SOON else SOONEST
+    first = [name for name in selectors if name in soonest]
     return [names for names in (first, [name for name in selectors if name not in first]) if names] or [[]]
 
 
@@ -320,38 +310,3 @@ def _told(setup: "Setup") -> dict[str, Any]:
         "expected_costs": next((dict(settings[COSTS]) for settings in told if COSTS in settings), None),
         "skills": None if skills is None else {policy: list(names) for policy, names in skills.able.items()},
     }
-
-
-def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[str]:
-    """Names of selectors to replay: those given, each once, else all that are installed. Fixed policies are left out: they are always added.
-
-    Args:
-        halved: whether there is another half of the log, whose outcomes a selector named `NAME:warm` is shown.
-
-    Raises:
-        UnknownNameError: no such selector.
-        UsageError: it needs a package that is not installed, or cannot start warm.
-    """
-    from osel_sim.analysis.engine import WARM
-    from osel_sim.analysis.result import REFERENCES
-    from osel_sim.analysis.warm_start import check_can_start_warm
-    from osel_sim.selection.registry import selector_locations
-    from osel_sim.selection.vowpal import available
-
-    locations = selector_locations()
-    if names is None:
-        # `auto` is another name of one of them, which need not run twice.
-        twins = {name for name, place in locations.items() if place == locations.get("auto") and name != "auto"}
-        names = sorted(name for name in locations if name not in twins and (available() or not name.startswith("vw_")))
-        names += [f"auto{WARM}"] if halved else []
-    for name in names:
-        kind = name.partition(":")[0]
-        if kind not in locations and name not in REFERENCES:
-            raise UnknownNameError("selector", name, {*locations, *REFERENCES} - {"fixed"})
-        if name.startswith("vw_") and not available():
-            raise UsageError(f"selector {name!r} needs the package vowpalwabbit: pip install 'osel-sim[vw]'")
-        if name.endswith(WARM) and kind != "fixed":
-            if not halved:
-                raise UsageError(f"selector {name!r} is shown the outcomes of the log's other half beforehand: say which half to replay with --half")
-            check_can_start_warm(kind)
-    return [name for name in dict.fromkeys(names) if name.partition(":")[0] != "fixed" and name not in REFERENCES]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 if TYPE_CHECKING:
     import pandas
 
+    from osel_sim.formats.budget import Spent
     from osel_sim.formats.journal import Decision
     from osel_sim.formats.rollout_log import Row
     from osel_sim.reporting.charts import Figure
@@ -33,6 +34,7 @@ class RunResult:
         page: the page about it, or None where it could not be written.
         interrupted: Ctrl-C ended it; `run(..., resume=True)` goes on.
         verdict: whether routing is worth it on its instances, as the page says it; empty without a page.
+        spent: what came of its budget; None of a run without one.
     """
 
     folder: Path
@@ -41,6 +43,7 @@ class RunResult:
     page: Path | None = None
     interrupted: bool = False
     verdict: str = ""
+    spent: "Spent | None" = None
 
     @cached_property
     def decisions(self) -> "pandas.DataFrame":
@@ -144,6 +147,39 @@ class ReplayResult:
         from osel_sim.analysis.result import tables
 
         return frame(tables(cast(dict[str, Any], self.result))[name] if self.result else [])
+
+
+@dataclass(frozen=True)
+class MomentsResult:
+    """What came of a replay of a table of moments.
+
+    Attributes:
+        folder: where everything lies that it wrote.
+        result: as `moments.json` has it.
+    """
+
+    folder: Path
+    result: Mapping[str, Any]
+
+    @property
+    def verdict(self) -> str:
+        """Whether to hand over, in words."""
+        return str(self.result["verdict"]["headline"])
+
+    @cached_property
+    def arms(self) -> "pandas.DataFrame":
+        """A row for each start selector with each monitor."""
+        return self._table("arms")
+
+    @cached_property
+    def gains(self) -> "pandas.DataFrame":
+        """A row a task, first policy, second policy and decision point: what handing over there gains."""
+        return self._table("gains")
+
+    def _table(self, name: str) -> "pandas.DataFrame":
+        from osel_sim.analysis.moment_tables import tables
+
+        return frame(tables(self.result)[name])
 
 
 @dataclass(frozen=True)

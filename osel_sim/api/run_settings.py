@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+from osel_sim.api.robot_settings import RobotSettings
 from osel_sim.api.settings import (
     MAIN,
     OTHER,
@@ -13,6 +14,7 @@ from osel_sim.api.settings import (
     Index,
     InstanceSettings,
     Names,
+    NonNegative,
     RewardSettings,
     settings,
 )
@@ -22,7 +24,7 @@ FILMED_EVERY = 5
 
 
 @settings
-class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
+class RunConfig(RobotSettings, RewardSettings, InstanceSettings, ContentSettings):
     """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward."""
 
     task: Annotated[Names, MAIN] = ()
@@ -59,15 +61,26 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """also write TensorBoard event files (needs the package tensorboard)"""
     realtime: Annotated[bool, OTHER] = False
     """sleep so that the robot moves in real time"""
+    budget_cents: Annotated[NonNegative | None, MAIN] = None
+    """never spend more cents than that: the selector spends them where they help most, and free policies take over when they are spent"""
+    budget_per: Annotated[Count | None, OTHER] = None
+    """with --budget-cents: a budget for each so many decisions, one after the other (default: one for the whole run)"""
     warm_start: Annotated[Folder | None, OTHER] = None
     """rollout log whose outcomes the selector is shown first (auto, linucb, thompson ...)"""
+    monitor: Annotated[str | None, OTHER] = None
+    """who drives on within an episode is decided by: value, blind:K:TO, stall, random:P ... (--list)"""
+    decide_every: Annotated[Count, OTHER] = 4
+    """with --monitor: a decision point is every so many calls"""
+    monitor_warm_start: Annotated[Folder | None, OTHER] = None
+    """log with a table of moments (record --moments) that the monitor is shown first (value)"""
 
     @property
     def folder(self) -> Path:
         """Where to write."""
         tasks = "-".join(name.replace(":", "-").replace("/", "-") for name in self.task)
         robot = f"-{self.robot}" if self.robot else ""
-        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}-s{self.seed}{robot}"
+        monitor = f"-{self.monitor.replace(':', '-')}" if self.monitor else ""
+        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}{monitor}-s{self.seed}{robot}"
 
     @property
     def filmed(self) -> frozenset[int]:

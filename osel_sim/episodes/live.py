@@ -18,6 +18,8 @@ from osel_sim.episodes.loop import run_episode
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
 from osel_sim.episodes.view import view
+from osel_sim.episodes.warnings import Watch
+from osel_sim.episodes.watching import RunMonitor
 from osel_sim.formats.counterfactual import COUNTERFACTUAL, Others, to_others
 from osel_sim.formats.journal import (
     JOURNAL,
@@ -32,12 +34,16 @@ from osel_sim.formats.journal import (
     read_lines,
     to_decision,
 )
+from osel_sim.formats.points import POINTS
+from osel_sim.formats.policy_file import Price
+from osel_sim.formats.run_warnings import RunWarning
 from osel_sim.formats.summary import check_summary
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome
-from osel_sim.interface.selector import Choice, Selector
+from osel_sim.interface.selector import Choice, Pays, Selector
 from osel_sim.interface.suite import Task
+from osel_sim.selection.dealing import By, robots_share
 from osel_sim.selection.reward import RewardWeights, check_reward, reward
 from osel_sim.suites.open_tasks import OpenTasks
 
@@ -53,7 +59,10 @@ class LiveOptions:
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
         context: `task` appends the task's name to the contexts that the selector is shown.
+        robots: how many take turns, decision by decision.
+        robots_by: what their instances differ in (`osel_sim.selection.dealing`); None: nothing.
         changes: policies that join and leave.
+        prices: what policies cost by their files, for warnings.
     """
 
     seed: int
@@ -64,7 +73,10 @@ class LiveOptions:
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
     context: str | None = None
+    robots: int = 1
+    robots_by: By | None = None
     changes: PolicyChanges = field(default_factory=PolicyChanges)
+    prices: Mapping[str, Price] = field(default_factory=dict)
 
 
 class LiveRun:
@@ -73,11 +85,15 @@ class LiveRun:
     What the folder holds is looked at before any of it is changed.
 
     Args:
-        subscribers: watch it (`osel_sim.episodes.run_subscribers`); the run itself writes its journal, counterfactual outcomes and contexts only.
+        subscribers: watch it (`osel_sim.episodes.run_subscribers`); the run itself writes its journal, counterfactual outcomes, contexts, and what a
+            monitor saw.
+        monitor: says who drives on within the chosen policies' episodes.
 
     Attributes:
         decisions: all so far.
+        warnings: all so far (`osel_sim.episodes.warnings`).
         rewards: of every policy (columns) in every decision (rows), NaN where there is none; only chosen ones without `counterfactual`.
+        alone: with `counterfactual` and a monitor, what each chosen policy comes to without it; None after an error.
 
     Raises:
         DataError: the folder's files are damaged, or do not fit together.
@@ -92,10 +108,11 @@ class LiveRun:
         selector: Selector,
         options: LiveOptions,
         subscribers: Sequence[RunSubscriber] = (),
+        monitor: RunMonitor | None = None,
     ) -> None:
         self.folder, self.tasks, self.encoder = folder, tasks, encoder
         self.drivers, self.selector, self.options = drivers, selector, options
-        self.subscribers = subscribers
+        self.subscribers, self.monitor = subscribers, monitor
         # Contexts are on disk about as soon as their decisions: a run that goes on, or was killed, can be reported on.
         self.envs, self.cache = OpenTasks(tasks), ContextCache(folder, autosave=1, mend=True)
         self.decisions = [to_decision(data, index, folder / JOURNAL) for index, (data, _) in enumerate(read_lines(folder / JOURNAL))]
@@ -104,10 +121,16 @@ class LiveRun:
         check_summary(folder, len(self.decisions))
         for name in (JOURNAL, COUNTERFACTUAL):
             check_digests(folder / name)
+        if monitor is not None:
+            monitor.open(folder, len(self.decisions))
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
+        self.warnings: list[RunWarning] = []
+        self._watch = Watch(options.prices, [(task.name, level) for task in tasks for level in options.levels])
         self._ever = tuple(selector.policies)
         self._rows: list[dict[str, float | None]] = []
+        self.alone: list[float | None] = []
+        self._horizons = {task.name: max(1, task.info.horizon) for task in tasks}
         # A journal begun by a version that did not tell scenes stays as it would have been.
         self._tells_scenes = not self.decisions or self.decisions[0].scene is not None
 
@@ -157,11 +180,15 @@ class LiveRun:
                     f"{self._journal.file}, line {decision.index + 1}: says {decision.policy!r} was chosen, this selector now chooses "
                     f"{choice.policy!r} with {choice.propensities}: the run was made with other versions or on another machine"
                 )
-            self._learn(context, choice, decision.reward)
+            self._learn(context, choice, decision)
+            self.warnings += self._watch.see(decision)
+            if self.monitor is not None:
+                self.monitor.replay(decision)
             known = {decision.policy: decision.reward}
             if self._others is not None:
                 others = self._checked_others(self._others.rows[decision.index][0], decision.index, decision.policy)
                 known |= others.rewards
+                self.alone += [others.alone_reward] if others.alone is not None else []
             self._rows.append(known)
         self._change(len(self.decisions))
 
@@ -176,6 +203,7 @@ class LiveRun:
         choice = self.selector.select(context)
         for subscriber in self.subscribers:
             subscriber.on_choice(index, choice.policy)
+        self.drivers.trust(choice.propensities)
         outcome = self._episode(index, instance, start, choice.policy, chosen=True)
         decision = self._decision(index, instance, choice, outcome, start.scene if self._tells_scenes else None)
         # What a suite or a selector of others got wrong is told now, not when the journal is read.
@@ -184,11 +212,15 @@ class LiveRun:
         if self._others is not None:
             rest = [policy for policy in self.selector.policies if policy != choice.policy]
             found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in rest}
-            others = Others(index, found, {policy: self._reward(other) for policy, other in found.items()})
+            others = Others(
+                index, found, {policy: self._reward(other) for policy, other in found.items()}, *self._alone(index, instance, start, choice)
+            )
             rewards |= others.rewards
             self._checked_others(as_read(others.to_dict(), f"{self._others.file}, line {index + 1}"), index, choice.policy)
             self._others.append(others.to_dict())
             checksums[COUNTERFACTUAL] = line_digest(others.to_dict())
+        if self.monitor is not None:
+            checksums[POINTS] = self.monitor.write(decision)
         for subscriber in self.subscribers:
             subscriber.on_decision(decision, rewards)
             subscriber.on_lines(index, checksums)
@@ -196,7 +228,13 @@ class LiveRun:
         self._journal.append(decision.to_dict())
         self.decisions.append(decision)
         self._rows.append(rewards)
-        self._learn(context, choice, decision.reward)
+        self._learn(context, choice, decision)
+        if self.monitor is not None:
+            self.monitor.learn(decision)
+        for warning in self._watch.see(decision):
+            self.warnings.append(warning)
+            for subscriber in self.subscribers:
+                subscriber.on_warning(warning)
         if self._change(index + 1):
             self._tell_changes(index + 1)
         return decision
@@ -209,22 +247,35 @@ class LiveRun:
         """Close the files and the environments, and write the contexts. May be called twice."""
         self.cache.save()
         self.envs.close()
-        for lines in (self._journal, self._others):
+        for lines in (self._journal, self._others, self.monitor):
             if lines is not None:
                 lines.close()
 
     def _episode(self, index: int, instance: Instance, start: Start, policy: str, chosen: bool) -> Outcome:
-        """One policy on the instance, from its beginning."""
+        """One policy on the instance, from its beginning; the chosen one with the monitor."""
         start.again()
         watching = [listener for subscriber in self.subscribers for listener in subscriber.watch(index, policy, chosen)]
         env, fallback = self.envs[instance.task], self.drivers.fallback(policy)
-        return run_episode(env, instance, self.drivers[policy], fallback, watching, action_noise=self.options.action_noise)
+        handoffs = None
+        if chosen and self.monitor is not None:
+            handoffs = self.monitor.handoffs(self.drivers, env.specification.horizon or self._horizons[instance.task])
+            watching.append(self.monitor.watch())
+        return run_episode(env, instance, self.drivers[policy], fallback, watching, action_noise=self.options.action_noise, handoffs=handoffs)
+
+    def _alone(self, index: int, instance: Instance, start: Start, choice: Choice) -> tuple[Outcome, float | None] | tuple[()]:
+        """What the chosen policy comes to without the monitor, with its reward; nothing where there is none."""
+        if self.monitor is None:
+            return ()
+        outcome = self._episode(index, instance, start, choice.policy, chosen=False)
+        self.alone.append(self._reward(outcome))
+        return outcome, self.alone[-1]
 
     def _instance(self, index: int) -> Instance:
         options = self.options
         chance = np.random.default_rng([options.seed, index])
-        task = self.tasks[int(chance.integers(len(self.tasks)))]
-        level = options.levels[int(chance.integers(len(options.levels)))]
+        tasks, levels = robots_share(self.tasks, options.levels, index % options.robots, options.robots, options.robots_by)
+        task = tasks[int(chance.integers(len(tasks)))]
+        level = levels[int(chance.integers(len(levels)))]
         return task.instance(options.seed * SEEDS_PER_RUN + index, level, options.split, options.axes)
 
     def _check(self, decision: Decision, instance: Instance) -> None:
@@ -241,6 +292,8 @@ class LiveRun:
         others = to_others(data, index, file, self.selector.policies, chosen)
         for policy, outcome in others.outcomes.items():
             check_reward(others.rewards[policy], outcome, self.options.weights, f"{file}, line {index + 1}: {policy}")
+        if others.alone is not None:
+            check_reward(others.alone_reward, others.alone, self.options.weights, f"{file}, line {index + 1}: alone")
         return others
 
     def _context(self, instance: Instance, loaded: bool) -> NDArray[np.float32]:
@@ -256,9 +309,11 @@ class LiveRun:
     def _reward(self, outcome: Outcome) -> float | None:
         return None if outcome.error is not None else reward(outcome, self.options.weights)
 
-    def _learn(self, context: NDArray[np.float32], choice: Choice, value: float | None) -> None:
-        if value is not None:  # an error teaches nothing
-            self.selector.update(context, choice, value)
+    def _learn(self, context: NDArray[np.float32], choice: Choice, decision: Decision) -> None:
+        if isinstance(self.selector, Pays):
+            self.selector.pay(decision.policy, decision.price)
+        if decision.reward is not None:  # an error teaches nothing
+            self.selector.update(context, choice, decision.reward)
 
     def _change(self, index: int) -> bool:
         """Let policies join and leave before a decision. Returns whether any does."""

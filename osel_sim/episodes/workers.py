@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim.core.errors import WorkerError
 from osel_sim.core.processes import Result, Work, run_jobs
+from osel_sim.episodes.moments import Cuts, MomentRunner, Moments
+from osel_sim.episodes.shard import Shard
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.interface.instance import Instance
@@ -46,6 +48,8 @@ class Plan:
         encoder: as `load_encoder` takes it.
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
+        cuts: where episodes are cut, to let other policies go on from there; None: nowhere.
+        shard: which of the instances are meant; None for all.
     """
 
     tasks: tuple[Task, ...]
@@ -59,26 +63,44 @@ class Plan:
     repeat_every: int = 1
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
+    cuts: Cuts | None = None
+    shard: Shard | None = None
 
     @functools.cached_property
     def instances(self) -> dict[str, Instance]:
         """Key -> instance, in the order of rows: task by task, seed by seed."""
-        drawn = (task.instance(seed, self.levels[seed % len(self.levels)], self.split, self.axes) for task in self.tasks for seed in self.seeds)
+        wanted = [(task, seed) for task in self.tasks for seed in self.seeds]
+        drawn = (self._instance(task, seed) for task, seed in (wanted if self.shard is None else self.shard.part(wanted)))
         return {instance.key: instance for instance in drawn}
+
+    @property
+    def perturbed(self) -> list[str]:
+        """Axes perturbed beyond an instance's level, as its `axes` says them; of a shard those of the whole: they depend on task and level alone."""
+        one_of_each = (self._instance(task, seed) for task in self.tasks for seed in self.seeds[: len(self.levels)])
+        return sorted({instance.axes for instance in [*self.instances.values(), *one_of_each] if instance.axes})
+
+    def _instance(self, task: Task, seed: int) -> Instance:
+        return task.instance(seed, self.levels[seed % len(self.levels)], self.split, self.axes)
 
     def episodes(self, instance: str) -> list[Episode]:
         """Those of the instance of this key, in the order of rows."""
-        turn = self.instances[instance].seed // len(self.levels)  # of all levels once: counting seeds would repeat some levels and never others
-        repeats = self.repeats if turn % self.repeat_every == 0 else 1
+        repeats = repeats_of(self.instances[instance].seed, len(self.levels), self.repeats, self.repeat_every)
         return [(spec.name, repeat) for spec in self.policies for repeat in range(repeats)]
+
+
+def repeats_of(seed: int, levels: int, repeats: int, repeat_every: int) -> int:
+    """Episodes of each policy on the instances of a seed; the rest as `Plan` has it, with the number of its levels."""
+    turn = seed // levels  # of all levels once: counting seeds would repeat some levels and never others
+    return repeats if turn % repeat_every == 0 else 1
 
 
 @dataclass
 class Recorded:
-    """One instance with the episodes asked for. `context` is None if the worker died before it was made."""
+    """One instance with the episodes asked for. `context` is None if the worker died before it was made; without cuts there are no moments."""
 
     instance: str
     rows: dict[Episode, Row] = field(default_factory=dict)
+    moments: dict[Episode, Moments] = field(default_factory=dict)
     context: "NDArray[np.float32] | None" = None
 
 
@@ -123,7 +145,9 @@ def record(
             else:
                 policy, repeat = job.episodes[event.index - 1]
                 if isinstance(event, Result):
-                    recorded.rows[policy, repeat], made = event.value, made + 1
+                    recorded.rows[policy, repeat], moments = event.value
+                    recorded.moments |= {(policy, repeat): moments} if moments is not None else {}
+                    made += 1
                 else:
                     cause = event.cause
                     recorded.rows[policy, repeat] = error_row(plan, job.instance, policy, repeat, f"{WORKER_DIED} ({cause})")
@@ -147,9 +171,12 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
     encoder, drivers = load_encoder(plan.encoder), Drivers(plan.everyone, common_specification(plan.tasks))
     if "torch" in sys.modules:  # importing it takes longer than an episode, and not every encoder and policy needs it
         sys.modules["torch"].set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
-    envs = OpenTasks(plan.tasks, keep=KEPT_OPEN)  # work comes task by task
+    envs = OpenTasks(plan.tasks, keep=KEPT_OPEN)  # work comes task by task, or some instances of each in turn
 
-    def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | Row]":
+    horizons = {task.name: max(1, task.info.horizon) for task in plan.tasks}
+    runner = None if plan.cuts is None else MomentRunner(drivers, [spec.name for spec in plan.policies], plan.cuts, encoder, plan.action_noise)
+
+    def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | tuple[Row, Moments | None]]":
         instance = plan.instances[job.instance]
         env = envs[instance.task]
         begin = Start(env, instance)
@@ -157,8 +184,12 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
             yield encoder.encode(view(env, encoder), instance.instruction)
         for policy, repeat in job.episodes[max(0, start - 1) :]:
             begin.again()
+            if runner is not None:
+                outcome, moments = runner.run(env, instance, policy, horizons[instance.task], repeat)
+                yield make_row(instance, policy, repeat, outcome, begin.scene), moments
+                continue
             outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat, action_noise=plan.action_noise)
-            yield make_row(instance, policy, repeat, outcome, begin.scene)
+            yield make_row(instance, policy, repeat, outcome, begin.scene), None
 
     return work
 

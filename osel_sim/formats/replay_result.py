@@ -18,6 +18,7 @@ from osel_sim.core.csv_text import to_csv
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_bytes, write_json
 from osel_sim.core.interrupts import uninterrupted
+from osel_sim.formats.moments_result import MOMENTS_RESULT
 
 SCHEMA_VERSION = 2
 """Version 2 has a verdict of three, with its words; intervals are over units. A replay of version 1 is shown as it was written."""
@@ -27,8 +28,8 @@ READABLE = (1, 2, CHANGING_VERSION)
 CHANGES = "changes"
 OFF_POLICY_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
-PENDING, FRONTIER = "pending", "frontier"
-"""Key of `replay.json` while not all is replayed: names of the selectors that are missing, and `frontier` where that is."""
+PENDING, FRONTIER, SHARING = "pending", "frontier", "sharing"
+"""Key of `replay.json` while not all is replayed: names of the selectors that are missing, and `frontier` and `sharing` where those are."""
 _PREFIX = "choice."
 
 
@@ -73,7 +74,7 @@ def check_replay_folder(folder: Path, overwrite: bool) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is a file; give a folder")
-    if (folder / REPLAY).exists() or (folder / OFF_POLICY).exists():
+    if any((folder / name).exists() for name in (REPLAY, OFF_POLICY, MOMENTS_RESULT)):
         if not overwrite:
             raise UsageError(f"--out {folder} holds a replay; add --overwrite to replace it, or give another folder")
     elif folder.exists() and any(not is_partial(item) and item.name != CHOICES for item in folder.iterdir()):

@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 from osel_sim.interface.selector import Context, State
 from osel_sim.selection.features import Components, Sketch
 
+SEEN, TURN = "scale.seen", "scale.turn"
+"""Keys of the state: the contexts so far, and how fitted components are turned."""
+
 FIRST, LAST = 16, 2048
 """Components are fitted when so many contexts have been seen, whenever their number has doubled since, and for the last time at the second number."""
 
@@ -20,7 +23,12 @@ class RunningComponents:
     Args:
         context_dim: length of a context.
         components: how many numbers to make of it; those that the contexts do not fill are 0.
+
+    Attributes:
+        fits: how often they were fitted; what was transformed before the last time looks different now.
     """
+
+    fits = 0
 
     def __init__(self, context_dim: int, components: int) -> None:
         self.dim = components
@@ -55,11 +63,11 @@ class RunningComponents:
     def state(self) -> State:
         """Arrays and values, copied."""
         fitted = {f"scale.fitted.{key}": value for key, value in self._fitted.state().items()}
-        return {"scale.seen": self._seen.copy(), "scale.turn": self._turn.copy(), **fitted}
+        return {SEEN: self._seen.copy(), TURN: self._turn.copy(), **fitted}
 
     def load(self, state: State) -> None:
         """Take over what `state` gave."""
-        self._seen, self._turn = state["scale.seen"].copy(), state["scale.turn"].copy()
+        self._seen, self._turn = state[SEEN].copy(), state[TURN].copy()
         prefix = "scale.fitted."
         self._fitted.load({key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)})
 
@@ -73,6 +81,7 @@ class RunningComponents:
             left, _, right = np.linalg.svd((fitted.transform(seen) @ wide).T @ before)
             wide = wide @ (left @ right)
         self._fitted, self._turn = fitted, np.ascontiguousarray(wide)
+        self.fits += 1
 
     def _features(self, sketched: NDArray[np.float64]) -> NDArray[np.float64]:
         if not len(self._turn):
