@@ -333,7 +333,8 @@ class _Run:
         films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
         if self.spending is not None:
-            self.spent = BudgetFile(self.spending, self.weights.success, config.episodes)
+            graded = "subgoals" if self.weights.success == "subgoals" else "success"
+            self.spent = BudgetFile(self.spending, graded, config.episodes)
         spent = [self.spent] if self.spent is not None else []
         return [TimingFile(), WarningFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
 
