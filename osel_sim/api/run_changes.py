@@ -74,6 +74,9 @@ def plan(config: "RunConfig", initial: "Sequence[PolicySpec]", environment: "Env
     names, file = [spec.name for spec in initial], config.folder / JOURNAL
     made = read_changes(config.folder, names)
     decisions = file.read_bytes().count(b"\n") if file.is_file() else 0
+    for flag, given in (("--monitor", config.monitor is not None), ("--robots", config.robots > 1)):
+        if given and (config.add_policies or config.retire):
+            raise UsageError(f"policies of a run with {flag} do not come and go; begin a new run with the policies that there are now")
     asked = _asked(config, names, made, decisions, environment, objects)
     if asked and config.monitor is not None:
         raise UsageError(f"a monitor ({config.monitor}) hands over among the policies that the run began with: begin a new run with other ones")
