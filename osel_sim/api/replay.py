@@ -65,6 +65,12 @@ class ReplayConfig(LoggedRewardSettings):
     """a gain in reward a decision that is not worth routing for"""
     route_with: Annotated[Names | None, OTHER] = None
     """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
+    join: Annotated[Names, OTHER] = ()
+    """POLICY@DECISION: a policy that is not there before that decision of a stream; what selectors make of it is reported"""
+    leave: Annotated[Names, OTHER] = ()
+    """POLICY@DECISION: a policy that is not there from that decision on"""
+    drift: Annotated[Names, OTHER] = ()
+    """from a decision on a price changes, price:POLICY:x2@DECISION, or a policy comes to what another of the log came to, POLICY=OTHER@DECISION"""
     encoder: Annotated[str | None, OTHER] = None
     """whose contexts, where the log has several, or auto: those that predict rewards best, by the choosing half (default: the one it was recorded
     with)"""
@@ -140,6 +146,7 @@ class _Replay:
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
         from osel_sim.analysis.logged_choices import choices_of, has_choices
+        from osel_sim.api.replay_changes import check_all_outcomes
         from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
 
         config, folder = self.config, self.config.folder
@@ -164,6 +171,7 @@ class _Replay:
             live = read_live(config.log, config.encoder)
             weights, preset = weights_of(config, recorded=live.reward)
         found = self._off_policy(live, weights)
+        check_all_outcomes(config, live.has_all_outcomes(weights))
         if live.has_all_outcomes(weights):
             return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
         write_off_policy(folder, found)
@@ -182,6 +190,7 @@ class _Replay:
         from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import Question, build, tables, with_fixed
+        from osel_sim.api.replay_changes import changes_asked, replay_changes
         from osel_sim.core.progress import progress
         from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
 
@@ -190,6 +199,10 @@ class _Replay:
             log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
+        if changes_asked(config):
+            return replay_changes(
+                *(config, log, setup(weights), selectors, left_out, preset, self.factories), lambda done: self._tell(done, config.folder, True)
+            )
         here, question = setup(weights), Question(config.margin, config.half is not None, config.route_with)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
