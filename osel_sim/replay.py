@@ -2,7 +2,7 @@
 
 import sys
 
-from osel_sim.api.replay import ReplayConfig
+from osel_sim.api.replay_settings import ReplayConfig
 from osel_sim.api.results import MomentsResult, ReplayResult
 from osel_sim.cli.command import Command
 
@@ -11,9 +11,9 @@ EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/pick_place --selectors ppo ucb1 --preset waymo --out runs/ppo
   python -m osel_sim.replay assets/logs/suite --half score --selectors auto auto:warm   # without and with the outcomes of the other half beforehand
   python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500 --no-frontier   # a quick look
-  python -m osel_sim.replay assets/logs/moments                                      # when to hand over within an episode, and to whom
   python -m osel_sim.replay assets/logs/suite --selectors auto linucb --join remote_large@500 --leave remote_large@1200   # a policy comes and goes
   python -m osel_sim.replay assets/logs/suite --selectors auto --drift price:remote_large:x2@800 remote_large=local_small@1200   # dearer, then worse
+  python -m osel_sim.replay assets/logs/moments                                      # when to hand over within an episode, and to whom
   python -m osel_sim.replay runs/pick_place-ppo-s0                                   # a live run: off-policy estimates from its propensities
 
 Shows the log's instances in random orders without replacement to every selector, which sees only the outcome of its choice, and says how far each

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from osel_sim.analysis.engine import Setup
     from osel_sim.analysis.log import LoggedOutcomes
     from osel_sim.analysis.streams import LeftOut
-    from osel_sim.api.replay import ReplayConfig
+    from osel_sim.api.replay_settings import ReplayConfig
     from osel_sim.api.results import ReplayResult
     from osel_sim.interface.selector import SelectorFactory
 

@@ -114,10 +114,10 @@ class LiveRun:
             monitor.open(folder, len(self.decisions))
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
-        self.alone: list[float | None] = []
-        self._horizons = {task.name: max(1, task.info.horizon) for task in tasks}
         self._ever = tuple(selector.policies)
         self._rows: list[dict[str, float | None]] = []
+        self.alone: list[float | None] = []
+        self._horizons = {task.name: max(1, task.info.horizon) for task in tasks}
         # A journal begun by a version that did not tell scenes stays as it would have been.
         self._tells_scenes = not self.decisions or self.decisions[0].scene is not None
 
@@ -197,8 +197,9 @@ class LiveRun:
         if self._others is not None:
             rest = [policy for policy in self.selector.policies if policy != choice.policy]
             found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in rest}
-            alone = self._alone(index, instance, start, choice)
-            others = Others(index, found, {policy: self._reward(other) for policy, other in found.items()}, *alone)
+            others = Others(
+                index, found, {policy: self._reward(other) for policy, other in found.items()}, *self._alone(index, instance, start, choice)
+            )
             rewards |= others.rewards
             self._checked_others(as_read(others.to_dict(), f"{self._others.file}, line {index + 1}"), index, choice.policy)
             self._others.append(others.to_dict())
