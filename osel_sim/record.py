@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.api.record import RecordConfig
+from osel_sim.api.record_settings import RecordConfig
 from osel_sim.cli.command import Command
 from osel_sim.core.errors import DataError, SettingError
 

@@ -19,6 +19,7 @@ EXAMPLES = """examples:
   python -m osel_sim.run --task open_drawer --policies local_small remote_specialist --monitor value   # and who drives on, within the episode
   python -m osel_sim.run --out runs/first --resume                         # goes on with it, if it was cut off
   python -m osel_sim.run --out runs/first --resume --episodes 200          # and on, to more decisions
+  python -m osel_sim.run --out runs/first --resume --episodes 300 --add-policies remote_large --retire local_small   # policies join and leave
   python -m osel_sim.run --config runs/first/run.json --seed 1 --out runs/second   # another run with the same settings
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,

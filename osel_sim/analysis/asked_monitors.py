@@ -48,7 +48,7 @@ def _ask(log: MomentLog, weights: RewardWeights, name: str, by: Rows, on: Rows, 
     """Fill in the turns of the instances `on`."""
     candidates = [Candidate(policy, bool(remote)) for policy, remote in zip(log.policies, log.remote, strict=True)]
     monitor = make_monitor(name, candidates, log.seen.pictures.shape[1], seed=0)
-    _show(log, weights, monitor, by)
+    show_ways(log, weights, monitor, by)
     for row in np.flatnonzero(on):
         instruction = log.whole.instances[row].instruction or ""
         for first, driver in enumerate(log.policies):
@@ -63,7 +63,7 @@ def _ask(log: MomentLog, weights: RewardWeights, name: str, by: Rows, on: Rows, 
                         break  # what would come after a handoff is not known
 
 
-def _show(log: MomentLog, weights: RewardWeights, monitor: Monitor, by: Rows) -> None:
+def show_ways(log: MomentLog, weights: RewardWeights, monitor: Monitor, by: Rows) -> None:
     """Let a monitor learn from every way on of these instances, in a random order, each as an episode with that one decision point."""
     rewards = log.rewards(weights)
     known = np.argwhere(np.isfinite(rewards) & by[:, None, None, None, None])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from osel_sim.core.errors import SettingError
 
 if TYPE_CHECKING:
-    from osel_sim.api.record import RecordConfig
+    from osel_sim.api.record_settings import RecordConfig
     from osel_sim.episodes.moments import Cuts
     from osel_sim.episodes.workers import Plan
     from osel_sim.interface.instance import Instance

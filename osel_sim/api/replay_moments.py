@@ -1,6 +1,6 @@
 """A replay of a table of moments: start selectors and monitors compared on what would have come of every handover."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from osel_sim.analysis.handovers import Handovers
     from osel_sim.analysis.moment_arms import Part
     from osel_sim.analysis.moment_log import MomentLog
-    from osel_sim.api.replay import ReplayConfig
+    from osel_sim.api.replay_settings import ReplayConfig
     from osel_sim.selection.reward import RewardWeights
 
 SELECTORS = ("auto", "auto:warm")
@@ -41,7 +41,8 @@ def replay_moments(config: "ReplayConfig") -> MomentsResult:
     from osel_sim.analysis.moment_arms import Starts
     from osel_sim.analysis.moment_log import read_moment_log
     from osel_sim.analysis.moment_result import Question, study
-    from osel_sim.api.replay import choose_selectors
+    from osel_sim.analysis.moment_tables import tables
+    from osel_sim.api.replay_settings import choose_selectors
     from osel_sim.formats.moments_result import write_moments_result
     from osel_sim.formats.replay_result import check_replay_folder
 
@@ -63,19 +64,6 @@ def replay_moments(config: "ReplayConfig") -> MomentsResult:
     result["log"] |= {"every": metadata["every"], "most": metadata["most"], "moments": int(log.there.sum()), "about": about}
     write_moments_result(config.folder, result, tables(result))
     return MomentsResult(config.folder, result)
-
-
-def tables(result: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """The CSV files, by name: a row an arm, and a row a task, first policy, second policy and decision point."""
-    arms = []
-    for arm in result["arms"]:
-        row: dict[str, Any] = {"start": arm["start"], "monitor": arm["monitor"]}
-        for name in ("reward", "success", "price", "seconds", "gain", "gain_success", "gain_price"):
-            row |= dict(zip((name, f"{name}_low", f"{name}_high"), arm.get(name) or (None,) * 3, strict=True))
-        row |= {name: arm.get(name) for name in ("duty", "recovered", "harmed", "p", "p_holm", "p_reward", "p_reward_holm", "of_gap")}
-        arms.append(row)
-    gains = [{**gain, "gain": gain["gain"]["value"], "gain_low": gain["gain"]["low"], "gain_high": gain["gain"]["high"]} for gain in result["gains"]]
-    return {"arms": arms, "gains": gains}
 
 
 def _part(log: "MomentLog", half: Any) -> "Part":

@@ -174,7 +174,7 @@ class MomentsResult:
         return self._table("gains")
 
     def _table(self, name: str) -> "pandas.DataFrame":
-        from osel_sim.api.replay_moments import tables
+        from osel_sim.analysis.moment_tables import tables
 
         return frame(tables(self.result)[name])
 

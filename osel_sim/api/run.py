@@ -16,8 +16,10 @@ from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.episodes.changes import PolicyChanges
     from osel_sim.episodes.live import LiveRun
     from osel_sim.episodes.run_subscribers import RunSubscriber
+    from osel_sim.formats.policy_changes import PolicyChange
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.interface.encoder import Encoder
     from osel_sim.interface.monitor import MonitorFactory
@@ -99,7 +101,9 @@ class _Run:
         monitor: "MonitorFactory | None" = None,
     ) -> None:
         from osel_sim.api.reward import weights_of
+        from osel_sim.api.run_changes import plan
         from osel_sim.api.run_monitor import check_monitor
+        from osel_sim.api.run_resume import policies_then
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
@@ -111,8 +115,11 @@ class _Run:
             check_installed()
         self.tasks = select_tasks(config.task, config.tasks, config.robot)
         self.environment = common_specification(self.tasks)
-        self.policies = choose_policies(config.policies, self.environment, config.policies_dir, objects)
+        names = policies_then(config.folder) if config.policies is None and config.resume else config.policies
+        self.policies = choose_policies(names, self.environment, config.policies_dir, objects)
         self.everyone = with_fallbacks(self.policies, config.policies_dir)
+        self.plan = plan(config, self.policies, self.environment, objects)
+        self.driving = with_fallbacks(self.plan.driving, config.policies_dir) if self.plan.changes else self.everyone
         self.weights = weights_of(config)[0]
         self._check_selector()
         check_monitor(config, monitor, self.policies)
@@ -136,13 +143,14 @@ class _Run:
         if then is not None and then < config.episodes:  # decisions do not depend on how many follow
             self.grown_from, configuration["episodes"] = then, then
         check_run_folder(folder, configuration, config.resume)
-        check_servers(self.everyone, self.environment)
+        check_servers(self.driving, self.environment)
         with contextlib.ExitStack() as holding:
             if config.resume:
                 holding.enter_context(held(folder))
             return self._run(folder, configuration, holding)
 
     def _run(self, folder: Path, configuration: dict[str, Any], holding: contextlib.ExitStack) -> RunResult:
+        from osel_sim.api.run_monitor import start_monitor_warm
         from osel_sim.context.encoder import load_encoder
         from osel_sim.context.names import DEFAULT_ENCODER
         from osel_sim.formats.journal import JOURNAL
@@ -163,8 +171,8 @@ class _Run:
         with contextlib.ExitStack() as stack:
             stack.enter_context(threads(1))
             selector = self._selector(encoder, configuration)
-            logger.info("%s: loading %s, starting servers ...", title(self.tasks), ", ".join(spec.name for spec in self.everyone))
-            drivers = stack.enter_context(Drivers(self.everyone, self.environment, self.objects))
+            logger.info("%s: loading %s, starting servers ...", title(self.tasks), ", ".join(spec.name for spec in self.driving))
+            drivers = stack.enter_context(Drivers(self.driving, self.environment, self.objects))
             # Only now, when all that could be missing is there, is the folder taken into use, and given back where not even one decision comes of it.
             if not config.resume:
                 holding.enter_context(taken(folder, (JOURNAL,)))
@@ -174,7 +182,9 @@ class _Run:
             stack.callback(live.close)
             if seen is not None:
                 self._start_warm(live, seen)
+            start_monitor_warm(config, live, self.grown_from)
             live.replay()
+            self._write_changes(folder)
             if self.grown_from is not None:
                 note_growth(folder, config.episodes)
             with _Interrupt() as interrupt:
@@ -241,6 +251,30 @@ class _Run:
             known |= wanted_of(self.config.selector, {"parts": parts})
         return make_selector(self.config.selector, names, sum(parts), self.config.seed, **known)
 
+    def _changes(self, encoder: "Encoder", selector: "Selector") -> "PolicyChanges":
+        """The changes of the run, with what the selector is told of policies when they join."""
+        from osel_sim.episodes.changes import PolicyChanges
+        from osel_sim.selection.changing import changing
+
+        changes = self.plan.changes
+        if changes:
+            changing(selector, any(change.event == "retire" for change in changes))
+
+        def told(change: "PolicyChange") -> dict[str, Any]:
+            known = self.factory is None and change.event == "add"
+            return _declared(self.config, self.tasks, self.plan.known_at(change), self.weights, encoder) if known else {}
+
+        return PolicyChanges(changes, tuple(map(told, changes)))
+
+    def _write_changes(self, folder: Path) -> None:
+        """Write down what the selector has been through, before a decision is made by it."""
+        from osel_sim.formats.policy_changes import note_changes, write_changes
+
+        if self.plan.asked:
+            write_changes(folder, self.plan.changes)
+        elif self.plan.made:
+            note_changes(folder, self.plan.made)
+
     def _log(self, folder: Path, encoder: str) -> "LoggedOutcomes":
         """The rollout log of a warm start."""
         from osel_sim.analysis.log import read_log
@@ -254,7 +288,8 @@ class _Run:
 
         config = self.config
         options = LiveOptions(
-            config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context
+            *(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context),
+            changes=self._changes(encoder, selector),
         )
         monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
         return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder), monitor)

@@ -20,7 +20,7 @@ def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     if not live.decisions:
         logger.warning("no decision was made")
         return {}
-    policies = live.selector.policies
+    policies = live.policies
     chosen = [policies.index(decision.policy) for decision in live.decisions]
     summary = {"task": title, **summarise(live.decisions, policies, selector)}
     if live.options.counterfactual:
@@ -41,7 +41,7 @@ def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:
 
     from osel_sim.selection.oracle import compare
 
-    rewards, policies = live.rewards, live.selector.policies
+    rewards, policies = live.rewards, live.policies
     complete = np.isfinite(rewards).all(axis=1)
     if not complete.any():
         return {}

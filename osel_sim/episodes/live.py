@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from osel_sim.context.appended import name_part
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
+from osel_sim.episodes.changes import PolicyChanges
 from osel_sim.episodes.drivers import Drivers
 from osel_sim.episodes.loop import run_episode
 from osel_sim.episodes.run_subscribers import RunSubscriber
@@ -54,6 +55,7 @@ class LiveOptions:
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
         context: `task` appends the task's name to the contexts that the selector is shown.
+        changes: policies that join and leave.
     """
 
     seed: int
@@ -64,6 +66,7 @@ class LiveOptions:
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
     context: str | None = None
+    changes: PolicyChanges = field(default_factory=PolicyChanges)
 
 
 class LiveRun:
@@ -111,7 +114,8 @@ class LiveRun:
             monitor.open(folder, len(self.decisions))
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
-        self._rows: list[list[float]] = []
+        self._ever = tuple(selector.policies)
+        self._rows: list[dict[str, float | None]] = []
         self.alone: list[float | None] = []
         self._horizons = {task.name: max(1, task.info.horizon) for task in tasks}
         # A journal begun by a version that did not tell scenes stays as it would have been.
@@ -119,13 +123,14 @@ class LiveRun:
 
     @property
     def policies(self) -> Sequence[str]:
-        """Names of the policies that are chosen from."""
-        return self.selector.policies
+        """Names of the policies that were ever chosen from; `selector.policies` are those that are now."""
+        return self._ever
 
     @property
     def rewards(self) -> NDArray[np.float64]:
-        """(decisions, policies), in the order of the selector's policies."""
-        return np.array(self._rows, np.float64).reshape(-1, len(self.policies))
+        """(decisions, policies), in the order of `policies`."""
+        table = [[float("nan") if (value := row.get(policy)) is None else value for policy in self._ever] for row in self._rows]
+        return np.array(table, np.float64).reshape(-1, len(self._ever))
 
     def run(self, decisions: int, stop: Callable[[], bool] = lambda: False) -> None:
         """Make decisions until there are so many, or `stop` says so. The run is closed then; its subscribers are told of all of it.
@@ -139,18 +144,20 @@ class LiveRun:
             with contextlib.closing(self):
                 for subscriber in self.subscribers:
                     subscriber.on_start(self)
+                self._tell_changes(len(self.decisions))
                 while len(self.decisions) < decisions and not stop():
                     self.decide()
             for subscriber in self.subscribers:
                 subscriber.on_end(self)
 
     def replay(self) -> None:
-        """Let the selector live through the journal, so that it is what it was when the run was cut off.
+        """Let the selector live through the journal, so that it is what it was when the run was cut off, and through what changes right after it.
 
         Raises:
             DataError: the selector decides otherwise than the journal says, or a line is not of the run's instance, or its reward is wrong.
         """
         for decision in self.decisions:
+            self._change(decision.index)
             instance = self._instance(decision.index)
             self._check(decision, instance)
             context = self._context(instance, loaded=False)
@@ -168,7 +175,8 @@ class LiveRun:
                 others = self._checked_others(self._others.rows[decision.index][0], decision.index, decision.policy)
                 known |= others.rewards
                 self.alone += [others.alone_reward] if others.alone is not None else []
-            self._remember(known)
+            self._rows.append(known)
+        self._change(len(self.decisions))
 
     def decide(self) -> Decision:
         """Make the next decision and write it down."""
@@ -187,7 +195,8 @@ class LiveRun:
         to_decision(as_read(decision.to_dict(), f"{self._journal.file}, line {index + 1}"), index, self._journal.file)
         rewards, checksums = {choice.policy: decision.reward}, {JOURNAL: line_digest(decision.to_dict())}
         if self._others is not None:
-            found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in self.policies if policy != choice.policy}
+            rest = [policy for policy in self.selector.policies if policy != choice.policy]
+            found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in rest}
             others = Others(
                 index, found, {policy: self._reward(other) for policy, other in found.items()}, *self._alone(index, instance, start, choice)
             )
@@ -203,10 +212,12 @@ class LiveRun:
         # The journal comes last: what it does not have did not happen.
         self._journal.append(decision.to_dict())
         self.decisions.append(decision)
-        self._remember(rewards)
+        self._rows.append(rewards)
         self._learn(context, choice, decision.reward)
         if self.monitor is not None:
             self.monitor.learn(decision)
+        if self._change(index + 1):
+            self._tell_changes(index + 1)
         return decision
 
     def instance_keys(self, count: int) -> frozenset[str]:
@@ -258,7 +269,7 @@ class LiveRun:
     def _checked_others(self, data: dict[str, Any], index: int, chosen: str) -> Others:
         """A line about the policies that were not chosen."""
         file = self.folder / COUNTERFACTUAL
-        others = to_others(data, index, file, self.policies, chosen)
+        others = to_others(data, index, file, self.selector.policies, chosen)
         for policy, outcome in others.outcomes.items():
             check_reward(others.rewards[policy], outcome, self.options.weights, f"{file}, line {index + 1}: {policy}")
         if others.alone is not None:
@@ -282,9 +293,16 @@ class LiveRun:
         if value is not None:  # an error teaches nothing
             self.selector.update(context, choice, value)
 
-    def _remember(self, rewards: dict[str, float | None]) -> None:
-        row = [rewards.get(policy) for policy in self.policies]
-        self._rows.append([float("nan") if value is None else value for value in row])
+    def _change(self, index: int) -> bool:
+        """Let policies join and leave before a decision. Returns whether any does."""
+        changed = self.options.changes.apply(self.selector, index)
+        self._ever = tuple(dict.fromkeys([*self._ever, *(change.policy for change in changed)]))
+        return bool(changed)
+
+    def _tell_changes(self, index: int) -> None:
+        for change in self.options.changes.made:
+            for subscriber in self.subscribers if change.before == index else ():
+                subscriber.on_event(change)
 
     def _decision(self, index: int, instance: Instance, choice: Choice, outcome: Outcome, scene: str | None) -> Decision:
         own: dict[str, Any] = {key: value for key, value in vars(outcome).items() if key not in ("fallback", "error")}

@@ -12,6 +12,7 @@ from osel_sim.episodes.loop import Subscriber
 from osel_sim.episodes.subscribers import RealTime, Timing
 from osel_sim.episodes.video import Video
 from osel_sim.formats.journal import TIMING, Decision, Lines
+from osel_sim.formats.policy_changes import PolicyChange
 
 VIDEOS = "videos"
 
@@ -27,7 +28,7 @@ class Run(Protocol):
 
     @property
     def policies(self) -> Sequence[str]:
-        """Names of the policies that are chosen from."""
+        """Names of the policies that were ever chosen from."""
         ...
 
     @property
@@ -49,6 +50,9 @@ class RunSubscriber:
 
     def on_start(self, run: Run) -> None:
         """The run begins, or goes on after the decisions that its journal has."""
+
+    def on_event(self, event: PolicyChange) -> None:
+        """A policy has joined or left, before the decision that comes next (`osel_sim.formats.policy_changes`)."""
 
     def on_instance(self, index: int) -> None:
         """A decision begins: its instance is about to be loaded."""

@@ -22,7 +22,10 @@ from osel_sim.formats.moments_result import MOMENTS_RESULT
 
 SCHEMA_VERSION = 2
 """Version 2 has a verdict of three, with its words; intervals are over units. A replay of version 1 is shown as it was written."""
-READABLE = (1, 2)
+CHANGING_VERSION = 3
+"""Of a replay whose streams change, which has `changes` and no verdict of three."""
+READABLE = (1, 2, CHANGING_VERSION)
+CHANGES = "changes"
 OFF_POLICY_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
 PENDING, FRONTIER = "pending", "frontier"

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -24,6 +25,9 @@ class MonitorBase(ABC):
     Raises:
         UsageError: no candidates, or one named twice.
     """
+
+    off_policy: ClassVar[bool] = False
+    """Whether it may learn from episodes that it did not watch itself, such as those of a log."""
 
     def __init__(self, candidates: Sequence[Candidate], picture_dim: int, seed: int) -> None:
         self.candidates, self.picture_dim, self.seed = tuple(candidates), picture_dim, seed

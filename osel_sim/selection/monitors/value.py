@@ -1,7 +1,7 @@
 """A monitor that learns what going on and handing over come to, and takes what is best by probability."""
 
 from collections.abc import Sequence
-from typing import override
+from typing import ClassVar, override
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,19 +10,21 @@ from osel_sim.interface.monitor import Candidate, DecisionPoint, Picture, Turn, 
 from osel_sim.selection.monitors.base import MonitorBase, number
 from osel_sim.selection.monitors.features import SIGNALS, signals
 from osel_sim.selection.regression import Moments, SharedRegression, fit
-from osel_sim.selection.scaling import RunningComponents
+from osel_sim.selection.scaling import LAST, RunningComponents
 from osel_sim.statistics.best import probability_of_best
 
 Array = NDArray[np.float64]
 
 COMPONENTS = 8
 """Of the picture."""
+WIDTH = 1 + SIGNALS + COMPONENTS
+"""Features of a decision point: 1, the signals, the picture."""
+DEVIATION = 0.5
+"""Standard deviation of rewards to expect before any two have differed: that of a success with probability 1/2."""
 MEAN, OWN, SHARED = 1.0, 0.1, 0.25
 """Prior variances relative to the noise's: of a mean, of weights of features that one turn has for itself, and of those that all have in common."""
 CONVINCED = 0.95
 """Probability of another policy to be best from which on nothing is left to chance over several decision points."""
-LATEST = 4_000
-"""It learns from so many decision points, the latest."""
 
 
 class ValueMonitor(MonitorBase):
@@ -43,15 +45,15 @@ class ValueMonitor(MonitorBase):
         UsageError: `most` is no such number.
     """
 
+    off_policy: ClassVar[bool] = True
+
     def __init__(self, candidates: Sequence[Candidate], picture_dim: int, seed: int, most: str = "1") -> None:
         super().__init__(candidates, picture_dim, seed)
         self._most = int(number(most, "monitor value: MOST", 1, whole=True))
         self._left, self._seen = self._most, 0  # handoffs left, decision points seen in this episode
         self._components = RunningComponents(picture_dim, COMPONENTS)
-        self._pictures: list[Picture] = []
-        self._signals: list[Array] = []
-        self._turns: list[int] = []
-        self._targets: list[float] = []
+        self._seen_points: list[tuple[Picture, Array, int, float]] = []  # kept as long as the components may still change
+        self._sums = _Sums(len(self.policies) ** 2)
         self._model: SharedRegression | None = None
         self._level, self._scale = 0.0, 1.0
 
@@ -78,14 +80,16 @@ class ValueMonitor(MonitorBase):
     @override
     def learn(self, watched: Watched) -> None:
         for point, turn, to_go in zip(watched.points, watched.turns, watched.to_go, strict=True):
-            picture = point.look.picture()
-            self._components.add(picture)
-            self._pictures.append(picture)
-            self._signals.append(signals(point))
-            self._turns.append(self._turn(point.driver, turn.policy))
-            self._targets.append(to_go)
-        for kept in (self._pictures, self._signals, self._turns, self._targets):
-            del kept[:-LATEST]
+            fits, seen = self._components.fits, (point.look.picture(), signals(point), self._turn(point.driver, turn.policy), to_go)
+            self._components.add(seen[0])
+            if self._sums.count < LAST:
+                self._seen_points.append(seen)
+            if self._components.fits > fits:
+                self._sums = _Sums(len(self.policies) ** 2)
+                for picture, signal, column, target in self._seen_points:
+                    self._sums.add(self._row(picture, signal), column, target)
+            else:
+                self._sums.add(self._row(*seen[:2]), *seen[2:])
         self._model = None  # fitted when it is next needed
 
     def expected(self, point: DecisionPoint) -> dict[str, float]:
@@ -97,7 +101,7 @@ class ValueMonitor(MonitorBase):
         return self.policies.index(driver) * len(self.policies) + self.policies.index(policy)
 
     def _row(self, picture: Picture, signal: Array) -> Array:
-        """Features of a decision point (1 + SIGNALS + COMPONENTS,)."""
+        """Features of a decision point (WIDTH,)."""
         return np.concatenate([[1.0], signal, self._components.transform(picture).astype(np.float64)])
 
     def _predict(self, driver: str, row: Array) -> tuple[Array, Array]:
@@ -113,18 +117,9 @@ class ValueMonitor(MonitorBase):
 
     def _fitted(self) -> SharedRegression:
         if self._model is None:
-            turns, width = len(self.policies) ** 2, 1 + SIGNALS + COMPONENTS
-            targets = np.array(self._targets, np.float64)
-            self._level = float(targets.mean()) if len(targets) else 0.0
-            self._scale = float(targets.std()) or 0.5 if len(targets) > 1 else 0.5
-            rows = np.ones((len(targets), width))
-            if len(targets):
-                rows[:, 1 : 1 + SIGNALS] = self._signals
-                rows[:, 1 + SIGNALS :] = self._components.transform(np.stack(self._pictures))
-            prior = np.full(width, OWN)
-            shared = np.full(width, SHARED)
+            prior, shared = np.full(WIDTH, OWN), np.full(WIDTH, SHARED)
             prior[0] = shared[0] = MEAN
-            moments = Moments.of(rows, np.array(self._turns, np.int64), (targets - self._level) / self._scale, turns)
+            moments, self._level, self._scale = self._sums.standardised()
             (self._model,) = fit(moments, prior, [shared])
         return self._model
 
@@ -139,3 +134,28 @@ class ValueMonitor(MonitorBase):
         spread = chances * (now / another)
         spread[stay] = 1.0 - now
         return np.asarray(spread / spread.sum(), np.float64)
+
+
+class _Sums:
+    """All that the regression needs to know of the decision points so far, T turns."""
+
+    def __init__(self, turns: int) -> None:
+        self.count = 0
+        self._products, self._vectors = np.zeros((turns, WIDTH, WIDTH)), np.zeros((turns, WIDTH))
+        self._total = self._squares = 0.0
+
+    def add(self, row: Array, turn: int, target: float) -> None:
+        """One more, with what came of that turn."""
+        self.count += 1
+        self._products[turn] += np.outer(row, row)
+        self._vectors[turn] += row * target
+        self._total += target
+        self._squares += target * target
+
+    def standardised(self) -> tuple[Moments, float, float]:
+        """The moments of the targets less their mean, in units of their deviation; and both."""
+        level = self._total / self.count if self.count else 0.0
+        around = max(self._squares - self.count * level * level, 0.0)
+        scale = float(np.sqrt(around / self.count)) if around > 1e-12 else DEVIATION
+        vectors = (self._vectors - level * self._products[:, :, 0]) / scale  # the first feature is 1
+        return Moments(self._products.copy(), vectors, around / scale**2, self.count), level, scale
