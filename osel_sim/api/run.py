@@ -122,7 +122,7 @@ class _Run:
         self.driving = with_fallbacks(self.plan.driving, config.policies_dir) if self.plan.changes else self.everyone
         self.weights = weights_of(config)[0]
         self._check_selector()
-        check_monitor(config, monitor, self.policies)
+        check_monitor(config, monitor, self.policies, changing=bool(self.plan.changes))
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
