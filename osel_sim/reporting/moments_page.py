@@ -194,7 +194,10 @@ def _duty(result: Mapping[str, Any]) -> Figure:
     arms = [arm for arm in result["arms"] if arm["monitor"] == "never" or arm["gain"] != [0.0, 0.0, 0.0]]
     dots = [Dot(arm["start"], certain(100 * arm["duty"]), _percent(arm["success"]), arm["monitor"]) for arm in arms]
     told = [f"{arm['start']} with {arm['monitor']} {100 * arm['success'][0]:.0f}% at {100 * arm['duty']:.0f}%" for arm in arms]
-    caption = "Each dot is a start selector with a monitor that hands something over, or with none. Up and to the left is better: more success with fewer steps of remote policies."
+    caption = (
+        "Each dot is a start selector with a monitor that hands something over, or with none. Up and to the left is better: more success with fewer "
+        "steps of remote policies."
+    )
     return Figure(
         "duty",
         "Duty against success",
