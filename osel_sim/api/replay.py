@@ -57,7 +57,6 @@ def replay(
     Raises:
         OselError: whatever is wrong with the settings or the log; the message says what.
     """
-    from osel_sim.api.replay_changes import check_all_outcomes
     from osel_sim.api.replay_moments import has_moments, replay_moments
     from osel_sim.interface.selector import factory_name
 
@@ -72,9 +71,6 @@ def replay(
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
     if has_moments(config.log):
-        check_all_outcomes(config, False)
-        if config.robots > 1:
-            raise SettingError("robots", f"{config.log} is a table of moments, of which monitors learn; leave the flag out")
         return replay_moments(config, factories, functions)
     if config.monitors:
         raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
