@@ -12,6 +12,7 @@ EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/suite --half score --selectors auto auto:warm   # without and with the outcomes of the other half beforehand
   python -m osel_sim.replay assets/logs/suite --selectors auto --budget-cents 5000   # what as much money buys, at best and by auto
   python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500 --no-frontier   # a quick look
+  python -m osel_sim.replay assets/logs/suite --selectors linucb --robots 4 --share every:20   # what do four robots gain by sharing?
   python -m osel_sim.replay assets/logs/suite --selectors auto linucb --join remote_large@500 --leave remote_large@1200   # a policy comes and goes
   python -m osel_sim.replay assets/logs/suite --selectors auto --drift price:remote_large:x2@800 remote_large=local_small@1200   # dearer, then worse
   python -m osel_sim.replay assets/logs/moments                                      # when to hand over within an episode, and to whom
@@ -59,7 +60,8 @@ def _print(result: ReplayResult) -> None:
     from osel_sim.cli.changes_tables import print_changes
     from osel_sim.cli.console import console
     from osel_sim.cli.replay_tables import print_off_policy, print_replay, print_so_far
-    from osel_sim.formats.replay_result import CHANGES
+    from osel_sim.cli.sharing_table import print_sharing
+    from osel_sim.formats.replay_result import CHANGES, SHARING
 
     if result.result is not None and result.pending:
         print_so_far(console(), result.result)
@@ -70,6 +72,8 @@ def _print(result: ReplayResult) -> None:
         print_changes(console(), result.result)
     elif result.result is not None:
         print_replay(console(), result.result)
+        if SHARING in result.result:
+            print_sharing(console(), result.result[SHARING])
     else:
         print("Only the outcomes of what was chosen are known, so selectors cannot be replayed (a live run has all with --counterfactual).")
 

@@ -213,7 +213,7 @@ def _run(
     if workers == 1:
         ready()
         for job in jobs:
-            with _one_thread():  # not around all of them: what is made of a part in between is not part of it
+            with one_thread():  # not around all of them: what is made of a part in between is not part of it
                 result = _replay_job(materials, factories, job)
             yield result
         return
@@ -224,10 +224,15 @@ def _run(
             yield event.value
 
 
-def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
-    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
+def one_thread_worker() -> None:
+    """Compute on one thread in this worker from now on."""
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
     threadpool_limits(1)
+
+
+def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
+    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
+    one_thread_worker()
     return lambda job, _: [_replay_job(materials, factories, job)]
 
 
@@ -247,7 +252,7 @@ def _replay_job(materials: Sequence[_Material], factories: Mapping[str, Selector
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
     import torch
 

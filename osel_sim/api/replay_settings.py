@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+from osel_sim.api.robot_settings import RobotSettings
 from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, NonNegative, settings
 from osel_sim.core.errors import UnknownNameError, UsageError
 
 
 @settings
-class ReplayConfig(LoggedRewardSettings):
+class ReplayConfig(RobotSettings, LoggedRewardSettings):
     """Replay a rollout log to selectors: how far from the oracle is each, and is routing worth it?"""
 
     log: Folder

@@ -3,7 +3,8 @@
 import contextlib
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,6 +103,7 @@ class _Run:
         monitor: "MonitorFactory | None" = None,
     ) -> None:
         from osel_sim.api.reward import weights_of
+        from osel_sim.api.robots import check_robots
         from osel_sim.api.run_budget import budget_of
         from osel_sim.api.run_changes import plan
         from osel_sim.api.run_monitor import check_monitor
@@ -125,6 +127,7 @@ class _Run:
         self.weights = weights_of(config)[0]
         self._check_selector()
         self.budget = budget_of(config, self.tasks, [*self.policies, *self.plan.joined.values()])
+        self.sharing = check_robots(config, self.tasks, named=self.factory is None)
         check_monitor(config, monitor, self.policies)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
@@ -216,6 +219,7 @@ class _Run:
 
     def _configuration(self) -> dict[str, Any]:
         """Everything the journal depends on but the encoder, content of files included."""
+        from osel_sim.api.robots import fleet_said
         from osel_sim.api.run_budget import said
         from osel_sim.api.run_monitor import monitor_said
         from osel_sim.core.files import digest
@@ -239,6 +243,7 @@ class _Run:
             "counterfactual": config.counterfactual,
             **({"context": config.context} if config.context else {}),
             **said(self.budget),
+            **fleet_said(config, self.sharing),
             **monitor_said(config),
             "content": {**content_digests(self.tasks, self.everyone), **warm},
         }
@@ -255,19 +260,20 @@ class _Run:
         return self.spending
 
     def _free_selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
+        from osel_sim.api.robots import in_turn
         from osel_sim.context.appended import LENGTH
         from osel_sim.selection.registry import make_selector, wanted_of
 
         names = [spec.name for spec in self.policies]
         parts = (encoder.dimension, LENGTH) if self.config.context else (encoder.dimension,)
         if self.factory is not None:
-            return self.factory(names, sum(parts), self.config.seed)
+            return in_turn(self.config, self.sharing, partial(self.factory, names, sum(parts)))
         known = _declared(self.config, self.tasks, self.policies, self.weights, encoder)
         if "skills" in known:
             configuration["skills"] = known["skills"].digest if known["skills"] is not None else None
         if len(parts) > 1:
             known |= wanted_of(self.config.selector, {"parts": parts})
-        return make_selector(self.config.selector, names, sum(parts), self.config.seed, **known)
+        return in_turn(self.config, self.sharing, partial(make_selector, self.config.selector, names, sum(parts), **known))
 
     def _changes(self, encoder: "Encoder", selector: "Selector") -> "PolicyChanges":
         """The changes of the run, with what the selector is told of policies when they join."""
@@ -310,6 +316,7 @@ class _Run:
             changes=self._changes(encoder, selector),
             prices={spec.name: spec.price for spec in (*self.policies, *self.plan.joined.values())},
         )
+        options = replace(options, robots=config.robots, robots_by=config.robots_by)
         monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
         return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder), monitor)
 
@@ -326,7 +333,8 @@ class _Run:
         films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
         if self.spending is not None:
-            self.spent = BudgetFile(self.spending, "subgoals" if self.weights.success == "subgoals" else "success", config.episodes)
+            graded = "subgoals" if self.weights.success == "subgoals" else "success"
+            self.spent = BudgetFile(self.spending, graded, config.episodes)
         spent = [self.spent] if self.spent is not None else []
         return [TimingFile(), WarningFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
 
@@ -342,12 +350,14 @@ class _Run:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
         from osel_sim.analysis.warm_start import WarmStart, show
         from osel_sim.api.run_resume import check_still_unseen
+        from osel_sim.selection.fleet import members
 
         own = live.instance_keys(self.config.episodes)
         if self.grown_from is not None:
             check_still_unseen(own - live.instance_keys(self.grown_from), log.keys, log.source, self.config.episodes)
         log = log.take([row for row, key in enumerate(log.keys) if key not in own])
-        count = show(live.selector, WarmStart(log.contexts, log.rewards(self.weights)), live.selector.policies, self.config.seed)
+        for selector in members(live.selector):
+            count = show(selector, WarmStart(log.contexts, log.rewards(self.weights)), selector.policies, self.config.seed)
         logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
 
     def _finish(self, live: "LiveRun", interrupted: bool) -> RunResult:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+from osel_sim.api.robot_settings import RobotSettings
 from osel_sim.api.settings import (
     MAIN,
     OTHER,
@@ -23,7 +24,7 @@ FILMED_EVERY = 5
 
 
 @settings
-class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
+class RunConfig(RobotSettings, RewardSettings, InstanceSettings, ContentSettings):
     """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward."""
 
     task: Annotated[Names, MAIN] = ()

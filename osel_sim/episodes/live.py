@@ -43,6 +43,7 @@ from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome
 from osel_sim.interface.selector import Choice, Pays, Selector
 from osel_sim.interface.suite import Task
+from osel_sim.selection.dealing import By, robots_share
 from osel_sim.selection.reward import RewardWeights, check_reward, reward
 from osel_sim.suites.open_tasks import OpenTasks
 
@@ -58,6 +59,8 @@ class LiveOptions:
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
         context: `task` appends the task's name to the contexts that the selector is shown.
+        robots: how many take turns, decision by decision.
+        robots_by: what their instances differ in (`osel_sim.selection.dealing`); None: nothing.
         changes: policies that join and leave.
         prices: what policies cost by their files, for warnings.
     """
@@ -70,6 +73,8 @@ class LiveOptions:
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
     context: str | None = None
+    robots: int = 1
+    robots_by: By | None = None
     changes: PolicyChanges = field(default_factory=PolicyChanges)
     prices: Mapping[str, Price] = field(default_factory=dict)
 
@@ -198,6 +203,7 @@ class LiveRun:
         choice = self.selector.select(context)
         for subscriber in self.subscribers:
             subscriber.on_choice(index, choice.policy)
+        self.drivers.trust(choice.propensities)
         outcome = self._episode(index, instance, start, choice.policy, chosen=True)
         decision = self._decision(index, instance, choice, outcome, start.scene if self._tells_scenes else None)
         # What a suite or a selector of others got wrong is told now, not when the journal is read.
@@ -267,8 +273,9 @@ class LiveRun:
     def _instance(self, index: int) -> Instance:
         options = self.options
         chance = np.random.default_rng([options.seed, index])
-        task = self.tasks[int(chance.integers(len(self.tasks)))]
-        level = options.levels[int(chance.integers(len(options.levels)))]
+        tasks, levels = robots_share(self.tasks, options.levels, index % options.robots, options.robots, options.robots_by)
+        task = tasks[int(chance.integers(len(tasks)))]
+        level = levels[int(chance.integers(len(levels)))]
         return task.instance(options.seed * SEEDS_PER_RUN + index, level, options.split, options.axes)
 
     def _check(self, decision: Decision, instance: Instance) -> None:

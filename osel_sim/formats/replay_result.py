@@ -28,8 +28,8 @@ READABLE = (1, 2, CHANGING_VERSION)
 CHANGES = "changes"
 OFF_POLICY_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
-PENDING, FRONTIER, BUDGET = "pending", "frontier", "budget"
-"""Key of `replay.json` while not all is replayed: names of the selectors that are missing, and `budget` and `frontier` where those are."""
+PENDING, FRONTIER, BUDGET, SHARING = "pending", "frontier", "budget", "sharing"
+"""Key of `replay.json` while not all is replayed: names of the selectors that are missing, and `budget`, `frontier` and `sharing` where those are."""
 _PREFIX = "choice."
 
 

@@ -15,6 +15,7 @@ from osel_sim.selection.base import SelectorBase
 from osel_sim.selection.change_point import PIECES, change_point
 from osel_sim.selection.features import Array, Features, Part, Sketch, warm_table
 from osel_sim.selection.regression import Moments, SharedRegression, fit
+from osel_sim.selection.shared_rows import SharedRows, part_of
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, UNKNOWN, Skills
 from osel_sim.statistics.best import probability_of_best
 
@@ -102,7 +103,7 @@ class Prior:
         return {**lists, **weights, **parts, **alarm, **least}
 
 
-class BayesianSelector(SelectorBase):
+class BayesianSelector(SharedRows, SelectorBase):
     """Regresses reward plus declared cost on features of the context and chooses by mean, uncertainty and chance.
 
     Model: reward + cost = mean of all + mean of the policy + (shared + own of the policy) . features + noise, all Gaussian
@@ -219,6 +220,7 @@ class BayesianSelector(SelectorBase):
         self._chosen.append(index)
         self._counts[index] += 1
         self._targets.append(float(reward + self._costs[index]))
+        self._note()
 
     def _catch_up(self) -> None:
         """Learn from what came since the last choice. Of several fits that are due only the last is computed, as nothing is left of those before: a
@@ -380,6 +382,7 @@ class BayesianSelector(SelectorBase):
             **({"view": self._view} if self._prior.parts else {}),
             "model": [self._centre, self._deviation, self._signal, self._next_fit],
             "random": self._generator.bit_generator.state,
+            **self._fresh_state(),
             **{f"regression.{key}": value for key, value in self._regression.state().items()},
             **{f"features.{key}": value for key, value in self._features.state().items()},
         }
@@ -390,11 +393,8 @@ class BayesianSelector(SelectorBase):
         self._counts = np.bincount(state["chosen"], minlength=len(self._costs))
         self._centre, self._deviation, self._signal, self._next_fit = state["model"]
         self._generator.bit_generator.state = state["random"]
-        self._regression = SharedRegression(**{key: copy(value) for key, value in _part(state, "regression.").items()})
+        self._regression = SharedRegression(**{key: copy(value) for key, value in part_of(state, "regression.").items()})
         self._view = state.get("view", 0)
-        self._features.load(_part(state, "features."))
+        self._features.load(part_of(state, "features."))
         self._known, self._seen, self._transformed = len(self._targets), None, None
-
-
-def _part(state: State, prefix: str) -> State:
-    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+        self._load_fresh(state)

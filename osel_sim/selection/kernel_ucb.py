@@ -24,6 +24,9 @@ class KernelUCBSelector(BayesianSelector):
     evidence says that a policy became better or worse, what was before is forgotten. Settings were chosen on made-up problems like those of
     `benchmarks/selection.py`, drawn from other seeds, and on the choosing half of `assets/logs/suite`.
 
+    Robots share their decisions: 4 * min(D, 256) + 24 bytes each for contexts of D numbers, 8 more with skills
+    (`osel_sim.selection.shared_rows.Rows`). Features, and how far each kind of them is believed, follow from those on every robot alike.
+
     Args:
         policies, context_dim, seed: see `SelectorBase`.
         expected_costs: policy -> declared alpha_time * time + alpha_price * price, as `episodes.expected_costs` gives; None learns them too.

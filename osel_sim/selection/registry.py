@@ -1,7 +1,7 @@
 """Selectors by name. Listing them imports none: torch and stable-baselines3 come in with the selector that needs them."""
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from osel_sim.core.errors import UnknownNameError, UsageError
@@ -125,6 +125,27 @@ def learns_off_policy(name: str) -> bool:
         UnknownNameError: no such selector.
     """
     return bool(getattr(_load(name), "off_policy", False))
+
+
+def can_share(name: str) -> bool:
+    """Whether robots can exchange what such a selector learns (`osel_sim.interface.selector.Shares`).
+
+    Raises:
+        UnknownNameError: no such selector.
+    """
+    return all(hasattr(_load(name), method) for method in ("begin", "share", "absorb"))
+
+
+def check_can_share(names: Iterable[str]) -> None:
+    """Refuse selectors that cannot share.
+
+    Raises:
+        UsageError: naming the first of them, and our own that can.
+    """
+    for name in names:
+        if not can_share(name):
+            those = ", ".join(own for own in BUILT_IN if not own.startswith("vw_") and can_share(own))
+            raise UsageError(f"selector {name!r} has nothing that robots could exchange; those that do: {those}")
 
 
 def _load(name: str) -> Any:

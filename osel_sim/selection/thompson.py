@@ -8,16 +8,19 @@ from numpy.typing import NDArray
 
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
+from osel_sim.selection.shared_means import SharedMeans, merged_means
 from osel_sim.statistics.best import probability_of_best
 
 
-class ThompsonSelector(SelectorBase):
+class ThompsonSelector(SharedMeans, SelectorBase):
     """Chooses each policy with the probability that its mean reward is the highest, by what has been seen.
 
     The belief about a policy with n rewards is Gaussian: their mean, drawn towards the mean of all rewards by one observation's weight, with
     variance noise / (n + 1). The noise is the rewards' variance about their policy's mean, pooled over the policies, with one observation of
     variance 1 to start from. Usually one draws from the beliefs and takes the highest; here the probabilities are integrated numerically and the
     choice is drawn from them, which is the same, and makes the propensities exact.
+
+    Robots share by `SharedMeans`: 16 bytes a policy and 8.
 
     Args:
         policies, context_dim, seed: see `SelectorBase`. The context is not looked at.
@@ -52,6 +55,11 @@ class ThompsonSelector(SelectorBase):
         before = reward - self._means[index]
         self._means[index] += before / self._counts[index]
         self._squares += before * (reward - self._means[index])
+        self._note(index, reward)
+
+    def _add(self, message: State) -> None:
+        self._counts, self._means, more = merged_means(self._counts, self._means, message)
+        self._squares += more
 
     def _add_policy(self, name: str) -> None:
         if name in self.known:
@@ -61,8 +69,9 @@ class ThompsonSelector(SelectorBase):
 
     def _state(self) -> State:
         values = {"counts": self._counts.copy(), "means": self._means.copy(), "squares": self._squares}
-        return {**values, "random": self._generator.bit_generator.state}
+        return self._with_fresh({**values, "random": self._generator.bit_generator.state})
 
     def _load(self, state: State) -> None:
         self._counts, self._means, self._squares = state["counts"].copy(), state["means"].copy(), state["squares"]
         self._generator.bit_generator.state = state["random"]
+        self._load_fresh(state)
