@@ -309,12 +309,13 @@ class _Run:
     def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
         from osel_sim.api.run_monitor import make_run_monitor
         from osel_sim.episodes.live import LiveOptions, LiveRun
+        from osel_sim.formats.merged_policy import is_merge
 
         config = self.config
         options = LiveOptions(
             *(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context),
             changes=self._changes(encoder, selector),
-            prices={spec.name: spec.price for spec in (*self.policies, *self.plan.joined.values())},
+            prices={spec.name: spec.price for spec in (*self.policies, *self.plan.joined.values()) if not is_merge(spec.name)},
         )
         options = replace(options, robots=config.robots, robots_by=config.robots_by)
         monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
