@@ -80,14 +80,13 @@ class Budgeted:
         context_dim, seed: of the selector within.
 
     Attributes:
-        policies: those of the selector within.
         spent: cents in the period so far.
         total: cents since the beginning.
         duals: price of a cent, in reward, at each decision.
     """
 
     def __init__(self, selector: Selector, budget: Budget, context_dim: int, seed: int) -> None:
-        self.inner, self.budget, self.policies = selector, budget, selector.policies
+        self.inner, self.budget = selector, budget
         for name in selector.policies:
             budget.of(name)
         self.spent = self.total = 0.0
@@ -98,6 +97,11 @@ class Budgeted:
         self._paid = 0.0
         self._generator = np.random.default_rng([seed, RECENT])
         self._guide = None if self._told(np.zeros(context_dim, np.float32)) is not None else self._make_guide(context_dim, seed)
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Those of the selector within."""
+        return self.inner.policies
 
     @property
     def left(self) -> float:
@@ -210,7 +214,6 @@ class Budgeted:
         for selector in (self.inner, self._guide):
             if selector is not None:
                 getattr(selector, method)(name)
-        self.policies = self.inner.policies
 
     def _told(self, context: Context) -> Array | None:
         """What the selector within expects of each policy, if it tells."""
