@@ -3,7 +3,19 @@
 import os
 import sys
 
+import pytest
+
 os.environ["HF_HUB_OFFLINE"] = "1"
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Byte code of the tests is kept whatever PYTHONDONTWRITEBYTECODE says: to rewrite their assertions takes each process seconds.
+# Mesa's llvmpipe draws small images in less time, to the same bytes, in the thread that asks for them.
+os.environ.setdefault("LP_NUM_THREADS", "0")
+# Byte code is kept whatever the environment says: to rewrite the assertions of the tests takes each process seconds, and so does it to compile the
+# package, which tests start in dozens of processes.
 sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
+
+@pytest.fixture(autouse=True, scope="session")
+def sb3_logs(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Where stable-baselines3 makes a folder whenever something learns, though it logs nothing."""
+    os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
