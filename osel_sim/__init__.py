@@ -22,8 +22,10 @@ if TYPE_CHECKING:
     from osel_sim.api.compare import CompareConfig, compare
     from osel_sim.api.ingest import IngestConfig, ingest
     from osel_sim.api.parts import load_log, load_policy, make_env, make_selector
-    from osel_sim.api.record import RecordConfig, record
-    from osel_sim.api.replay import ReplayConfig, replay
+    from osel_sim.api.record import record
+    from osel_sim.api.record_settings import RecordConfig
+    from osel_sim.api.replay import replay
+    from osel_sim.api.replay_settings import ReplayConfig
     from osel_sim.api.report import ReportConfig, report
     from osel_sim.api.run import run
     from osel_sim.api.run_settings import RunConfig
@@ -39,8 +41,8 @@ _PLACES = {
     "CompareConfig": "api.compare",
     "IngestConfig": "api.ingest",
     "OselError": "core.errors",
-    "RecordConfig": "api.record",
-    "ReplayConfig": "api.replay",
+    "RecordConfig": "api.record_settings",
+    "ReplayConfig": "api.replay_settings",
     "ReportConfig": "api.report",
     "RunConfig": "api.run_settings",
     "SelectorBase": "selection.base",

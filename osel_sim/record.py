@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.api.record import RecordConfig
+from osel_sim.api.record_settings import RecordConfig
 from osel_sim.cli.command import Command
 from osel_sim.core.errors import DataError, SettingError
 
@@ -22,11 +22,13 @@ EXAMPLES = """examples:
   python -m osel_sim.record --task all --instances 300 --level 0 1 2 3 --repeats 3 --repeat-every 10 --out logs/suite
   python -m osel_sim.record --task pick_place --policies old new --instances 500 --until-decided --out logs/which    # stop as soon as it is told
   python -m osel_sim.record --policies new --baseline logs/old --until-decided --out logs/new     # the same, against a log, on its instances
+  python -m osel_sim.record --task lift --instances 20 --policies local_small remote_large --moments 6 --out logs/moments     # when to hand over
   python -m osel_sim.record --summary logs/mine                                            # print the tables of a log again
 
 Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.npz. Every policy starts from the same state of the same instance. The
 files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies, more
 repeats and an encoder given with it are added to what is there, and the log is read with the encoder given last.
+--moments K cuts every episode before every K-th call and lets every other policy drive on from there: moments.parquet, which replay reads.
 --until-decided looks after every 10 instances or more, --instances being the most; docs/compare.md says why such looks are honest."""
 
 

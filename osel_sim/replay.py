@@ -2,8 +2,8 @@
 
 import sys
 
-from osel_sim.api.replay import ReplayConfig
-from osel_sim.api.results import ReplayResult
+from osel_sim.api.replay_settings import ReplayConfig
+from osel_sim.api.results import MomentsResult, ReplayResult
 from osel_sim.cli.command import Command
 
 EXAMPLES = """examples:
@@ -11,6 +11,9 @@ EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/pick_place --selectors ppo ucb1 --preset waymo --out runs/ppo
   python -m osel_sim.replay assets/logs/suite --half score --selectors auto auto:warm   # without and with the outcomes of the other half beforehand
   python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500 --no-frontier   # a quick look
+  python -m osel_sim.replay assets/logs/suite --selectors auto linucb --join remote_large@500 --leave remote_large@1200   # a policy comes and goes
+  python -m osel_sim.replay assets/logs/suite --selectors auto --drift price:remote_large:x2@800 remote_large=local_small@1200   # dearer, then worse
+  python -m osel_sim.replay assets/logs/moments                                      # when to hand over within an episode, and to whom
   python -m osel_sim.replay runs/pick_place-ppo-s0                                   # a live run: off-policy estimates from its propensities
 
 Shows the log's instances in random orders without replacement to every selector, which sees only the outcome of its choice, and says how far each
@@ -25,14 +28,22 @@ is written, page included with --open: Ctrl-C loses no more than what is being r
 
 Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv, frontier.csv. Of a live run's folder it estimates
 what each fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes.
-Likewise of a log of somebody's own decisions (ingest --propensity)."""
+Likewise of a log of somebody's own decisions (ingest --propensity). Of a log with moments (record --moments) it compares monitors and start
+selectors: moments.json, arms.csv, gains.csv (docs/moments.md)."""
 
 
 def _execute(config: ReplayConfig) -> int:
     from osel_sim.api.replay import replay
+    from osel_sim.cli.console import console
+    from osel_sim.cli.moments_tables import print_moments
     from osel_sim.cli.next_step import print_next
 
     result = replay(config, on_result=_print)
+    if isinstance(result, MomentsResult):
+        print_moments(console(), result.result)
+        print(f"written to {result.folder}")
+        print_next(("makes a page of it", "report", [result.folder, "--open"]))
+        return 0
     print(f"written to {result.folder}")
     if not config.open:
         page = result.folder if result.result is not None else config.log  # of estimates alone: the page is the run's, or the log's
@@ -42,15 +53,19 @@ def _execute(config: ReplayConfig) -> int:
 
 def _print(result: ReplayResult) -> None:
     """The verdict so far, while more is to come; in the end everything."""
+    from osel_sim.cli.changes_tables import print_changes
     from osel_sim.cli.console import console
     from osel_sim.cli.replay_tables import print_off_policy, print_replay, print_so_far
+    from osel_sim.formats.replay_result import CHANGES
 
     if result.result is not None and result.pending:
         print_so_far(console(), result.result)
         return
     if result.off_policy is not None:
         print_off_policy(console(), result.off_policy)
-    if result.result is not None:
+    if result.result is not None and CHANGES in result.result:
+        print_changes(console(), result.result)
+    elif result.result is not None:
         print_replay(console(), result.result)
     else:
         print("Only the outcomes of what was chosen are known, so selectors cannot be replayed (a live run has all with --counterfactual).")

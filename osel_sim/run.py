@@ -16,12 +16,15 @@ EXAMPLES = """examples:
   python -m osel_sim.run --task tag:short --level 0 2 --episodes 200       # several tasks and levels, mixed
   python -m osel_sim.run --task all --level 0 2 --selector auto --encoder osel_suite --warm-start assets/logs/suite   # it has seen a log's outcomes
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
+  python -m osel_sim.run --task open_drawer --policies local_small remote_specialist --monitor value   # and who drives on, within the episode
   python -m osel_sim.run --out runs/first --resume                         # goes on with it, if it was cut off
   python -m osel_sim.run --out runs/first --resume --episodes 200          # and on, to more decisions
+  python -m osel_sim.run --out runs/first --resume --episodes 300 --add-policies remote_large --retire local_small   # policies join and leave
   python -m osel_sim.run --config runs/first/run.json --seed 1 --out runs/second   # another run with the same settings
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
-contexts.npz, selector.safetensors, summary.json, curve.png, videos/, and report.html, the page about it, with figures/ and tables/ beside it.
+points.jsonl (what a monitor saw), contexts.npz, selector.safetensors, summary.json, curve.png, videos/, and report.html, the page about it, with
+figures/ and tables/ beside it.
 Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 
 
@@ -29,10 +32,13 @@ def _execute(config: RunConfig) -> int:
     from osel_sim.api.run import run
     from osel_sim.cli.causes import print_causes
     from osel_sim.cli.console import console, plain, run_table
+    from osel_sim.cli.monitor_words import monitor_words
 
     result = run(config)
     if result.journal:
         console().print(run_table(dict(result.summary)))
+        if config.monitor and "monitor" in result.summary:
+            console().print(plain(monitor_words(config.monitor, result.summary)), soft_wrap=True)
         if result.verdict:
             console().print(plain(result.verdict, "bold"), soft_wrap=True)
         print_causes((decision.policy, f"decision {decision.index}", decision.error) for decision in result.journal if decision.error)

@@ -1,6 +1,6 @@
 """A live run's folder as material for offline evaluation: what was chosen, with which probability, and what came of it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from osel_sim.core.errors import DataError
 from osel_sim.core.files import read_json
 from osel_sim.formats.counterfactual import COUNTERFACTUAL, to_others
 from osel_sim.formats.journal import JOURNAL, SEEDS_PER_RUN, TIMING, Decision, check_beside, check_digests, read_journal, read_lines
+from osel_sim.formats.policy_changes import PolicyChange, available, ever, read_changes
 from osel_sim.formats.rollout_log import ROLLOUTS, Row
 from osel_sim.formats.run_config import RUN, read_run
 from osel_sim.formats.summary import SUMMARY
@@ -37,6 +38,7 @@ class LiveLog:
         propensities: (T, P) with which each policy would have been chosen.
         selector: name of the selector that chose.
         reward: weights that the run was made with, as `RewardWeights` takes them.
+        changes: policies that joined and left; `outcomes` has all that ever were, of which one that was not there has the propensity 0.
     """
 
     decisions: tuple[Decision, ...]
@@ -45,6 +47,7 @@ class LiveLog:
     propensities: Array
     selector: str
     reward: dict[str, Any]
+    changes: tuple[PolicyChange, ...] = ()
 
     def has_all_outcomes(self, weights: RewardWeights) -> bool:
         """Whether some decision has the outcome of every policy, so that selectors can be replayed on it."""
@@ -66,7 +69,9 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
         DataError: its files are missing or damaged, do not fit together, it made no decision, or an instance has no context.
     """
     configuration = _configuration(folder)
-    policies, weights = configuration["policies"], weights_from(configuration["reward"], f"{folder / RUN}: configuration.reward")
+    initial, weights = configuration["policies"], weights_from(configuration["reward"], f"{folder / RUN}: configuration.reward")
+    changes = read_changes(folder, initial)
+    policies = list(ever(initial, changes))
     journal = read_journal(folder / JOURNAL)
     for name in (COUNTERFACTUAL, TIMING):
         check_beside(folder / name, len(journal))
@@ -76,13 +81,15 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     if not decisions:
         raise DataError(f"{folder / JOURNAL}: the run made no decision")
     for decision in decisions:
-        _check(decision, configuration, weights, f"{folder / JOURNAL}, line {decision.index + 1}")
+        there = available(initial, changes, decision.index)
+        _check(decision, configuration, there, weights, f"{folder / JOURNAL}, line {decision.index + 1}")
     instances = named_robots(
         LoggedInstance(decision.instance, **{name: getattr(decision, name) for name in ABOUT if name != "axes"}) for decision in decisions
     )
     rows = [_row(decision, decision.policy, decision.outcome) for decision in decisions]
     for decision, (data, _) in zip(decisions, read_lines(folder / COUNTERFACTUAL), strict=False):  # a killed run may have one line more
-        others = to_others(data, decision.index, folder / COUNTERFACTUAL, policies, decision.policy)
+        there = available(initial, changes, decision.index)
+        others = to_others(data, decision.index, folder / COUNTERFACTUAL, there, decision.policy)
         for policy, outcome in others.outcomes.items():
             check_reward(others.rewards[policy], outcome, weights, f"{folder / COUNTERFACTUAL}, line {decision.index + 1}: {policy}")
             rows.append(_row(decision, policy, outcome))
@@ -91,10 +98,16 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     keys = [instance.key for instance in instances]
     identity, contexts = read_contexts(folder, keys, encoder or configuration.get("encoder"))
     arrays = dense(folder, rows, keys, policies)
-    outcomes = LoggedOutcomes(folder, instances, tuple(policies), contexts, identity, **arrays, metadata=configuration, skills=None)
+    outcomes = LoggedOutcomes(folder, instances, tuple(policies), contexts, identity, **arrays, metadata=configuration | _told(changes), skills=None)
     propensities = np.array([[decision.propensities.get(policy, 0.0) for policy in policies] for decision in decisions], np.float64)
     chosen = np.array([policies.index(decision.policy) for decision in decisions], np.int64)
-    return LiveLog(tuple(decisions), outcomes, chosen, propensities, str(configuration.get("selector", "unknown")), asdict(weights))
+    selector = str(configuration.get("selector", "unknown"))
+    return LiveLog(tuple(decisions), outcomes, chosen, propensities, selector, asdict(weights), changes)
+
+
+def _told(changes: Sequence[PolicyChange]) -> dict[str, Any]:
+    """What the facts about a run say of its changes."""
+    return {"changes": [change.words for change in changes]} if changes else {}
 
 
 def _as_far_as_contexts(folder: Path, decisions: list[Decision], encoder: str | None) -> list[Decision]:
@@ -126,11 +139,11 @@ def _configuration(folder: Path) -> dict[str, Any]:
     return configuration
 
 
-def _check(decision: Decision, configuration: Mapping[str, Any], weights: RewardWeights, place: str) -> None:
-    """Refuse a decision that this run cannot have made."""
-    if decision.policy not in configuration["policies"] or not decision.propensities[decision.policy] > 0.0:
+def _check(decision: Decision, configuration: Mapping[str, Any], there: Sequence[str], weights: RewardWeights, place: str) -> None:
+    """Refuse a decision that this run cannot have made, whose policies then were `there`."""
+    if decision.policy not in there or not decision.propensities[decision.policy] > 0.0:
         raise DataError(f"{place}: {decision.policy!r} is no policy of the run, or has no propensity")
-    if unknown := set(decision.propensities) - set(configuration["policies"]):
+    if unknown := set(decision.propensities) - set(there):
         raise DataError(f"{place}: propensities of policies that the run does not have: {quoted(sorted(unknown))}")
     tasks = configuration.get("tasks")
     if tasks and decision.task not in tasks:
@@ -143,6 +156,6 @@ def _check(decision: Decision, configuration: Mapping[str, Any], weights: Reward
 
 
 def _row(decision: Decision, policy: str, outcome: Outcome) -> Row:
-    own = {key: value for key, value in vars(outcome).items() if key != "seconds"}
+    own = {key: value for key, value in vars(outcome).items() if key not in ("seconds", "monitored")}
     about: dict[str, Any] = {name: getattr(decision, name) for name in ABOUT}
     return Row(**about, instance=decision.instance, policy=policy, repeat=0, **own, **vars(outcome.seconds))

@@ -4,6 +4,7 @@ Each says what a chooser would receive on every instance, so that it can be aver
 """
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,9 +12,12 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.cross_fit import Rows, cross_fit
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
-from osel_sim.analysis.routers import BY_TEXT, SHRINK, SINGLE, TEXT, Router, group_numbers, routers
+from osel_sim.analysis.routers import BY_TEXT, MODELS, SHRINK, SINGLE, TEXT, Router, group_numbers, routers
 from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
+
+FOLDS = 5
+"""Parts of a log, on all but one of which a model learns what its ceiling is (`osel_sim.analysis.verdict`)."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,7 @@ class Oracles:
             theirs.
         predictable: (N,) reward of the policy that a supervised router, trained on *other* instances, names.
         router: which one (`osel_sim.analysis.routers`), for each half of the instances (`first`, `second`) it was scored on.
-        routed: name of every router that was tried -> (N,) reward of the policy it names, learned on the half that the instance is not in.
+        routed: name of every router that was tried -> (N,) reward of the policy it names, learned on the half (or all parts) it is not in.
         per_task: column of the policy with the highest mean reward on each instance's task, (N,).
     """
 
@@ -102,7 +106,8 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
         means: (N, P) mean rewards.
 
     Returns:
-        its reward on every instance, (N,), the router used for each half, and the rewards (N,) of every router that routes at all.
+        its reward on every instance, (N,), the router used for each half, and the rewards (N,) of every router that routes at all, of the models
+        also those learned on `FOLDS - 1` of `FOLDS` parts: what half of a log does not teach yet, more of it may.
     """
     from threadpoolctl import threadpool_limits
 
@@ -123,10 +128,12 @@ def predictable_oracle(log: LoggedOutcomes, means: Array) -> tuple[Array, dict[s
 
     with threadpool_limits(1):  # the last bits of a matrix product depend on the number of threads
         table = cross_fit(~half, decide)
+        more = _by_most_others(log, means, {name: found[name] for name in MODELS})
     routed = dict(zip(found, table.T, strict=True))
     if BY_TEXT in routed:
         routed[BY_TEXT] = _by_other_rows_of_the_text(log, means)
     value = np.where(half, routed[used[1]], routed[used[0]])
+    routed |= more
     return value, dict(zip(("first", "second"), used, strict=True)), {name: own for name, own in routed.items() if name != SINGLE}
 
 
@@ -146,6 +153,17 @@ def _by_other_rows_of_the_text(log: LoggedOutcomes, means: Array) -> Array:
     sums = np.stack([np.bincount(groups, weights=column) for column in means.T], axis=1)
     beliefs = (sums[groups] - means + SHRINK * others) / (np.bincount(groups)[groups] - 1.0 + SHRINK)[:, None]
     return np.asarray(means[np.arange(len(log)), beliefs.argmax(axis=1)], np.float64)
+
+
+def _by_most_others(log: LoggedOutcomes, means: Array, models: Mapping[str, Router]) -> dict[str, Array]:
+    """Rewards (N,) of what each model names for an instance, learned on the other parts of the log."""
+    part = np.array([hashlib.sha256(key.encode()).digest()[3] % FOLDS for key in log.keys])
+    found = {f"{name}, learned on {FOLDS - 1} of {FOLDS} parts": np.zeros(len(log)) for name in models}
+    for number in range(FOLDS):
+        on = part == number
+        for name, model in zip(found, models.values(), strict=True):
+            found[name][on] = _received(means, model, ~on, on)
+    return found
 
 
 def _received(means: Array, router: Router, by: Rows, on: Rows) -> Array:

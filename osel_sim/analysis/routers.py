@@ -44,6 +44,9 @@ MOST = 4_000
 
 NEIGHBOURS = (20, 60)
 
+MODELS = ("ridge regression", *(f"{count} nearest neighbours" for count in NEIGHBOURS), "extremely randomised trees")
+"""Names of the routers that are regressions of rewards on contexts and labels."""
+
 
 def routers(log: LoggedOutcomes, means: Array) -> dict[str, Router]:
     """All there are, by name; those that know least come first.
@@ -123,8 +126,9 @@ def _models() -> dict[str, Callable[[int], Any]]:
     def neighbours(count: int) -> Callable[[int], Any]:
         return lambda rows: KNeighborsRegressor(min(count, rows // 2), algorithm="brute")
 
-    return {
-        "ridge regression": lambda _: RidgeCV(np.logspace(-3.0, 4.0, 15)),
-        **{f"{count} nearest neighbours": neighbours(count) for count in NEIGHBOURS},
-        "extremely randomised trees": lambda _: ExtraTreesRegressor(30, min_samples_leaf=10, max_features=0.3, random_state=0),
-    }
+    made = (
+        lambda _: RidgeCV(np.logspace(-3.0, 4.0, 15)),
+        *(neighbours(count) for count in NEIGHBOURS),
+        lambda _: ExtraTreesRegressor(30, min_samples_leaf=10, max_features=0.3, random_state=0),
+    )
+    return dict(zip(MODELS, made, strict=True))

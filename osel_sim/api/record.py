@@ -6,12 +6,12 @@ from collections.abc import Mapping, Set
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from annotated_types import Ge, Le
-
+from osel_sim.api.record_moments import as_begun as moments_as_begun
+from osel_sim.api.record_moments import check_moments, cuts_of, in_blocks, said_of
+from osel_sim.api.record_settings import RecordConfig
 from osel_sim.api.results import RecordResult
-from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Folder, Group, Index, InstanceSettings, Names, settings
 from osel_sim.api.until_decided import baseline_then, concluded, instances_of, said, stopping
 from osel_sim.core.errors import DataError, SettingError
 from osel_sim.core.trust import trusting
@@ -24,43 +24,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-STOPPING = Group("Stopping early", 0.5)
 _FIXED = {"task": "tasks", "level": "levels", "axis": "axes"} | {name: name for name in ("instances", "start_seed", "action_noise", "split")}
 """Setting -> key in run.json of what a recording keeps from its beginning to its end."""
-
-
-@settings
-class RecordConfig(InstanceSettings, ContentSettings):
-    """Run every policy on the same instances and write the outcomes to a rollout log."""
-
-    task: Annotated[Names, MAIN] = ()
-    """which tasks: names, tag:TAG, or all; of other suites SUITE:NAME"""
-    policies: Annotated[Names | None, MAIN] = None
-    """policies to run (default: all that fit the tasks)"""
-    instances: Annotated[Count, MAIN] = 200
-    """number of instances of each task"""
-    repeats: Annotated[Count | None, MAIN] = None
-    """episodes of each policy on an instance (default: 1)"""
-    repeat_every: Annotated[Count | None, MAIN] = None
-    """repeat on one in so many instances of each level only (default: on all)"""
-    encoder: Annotated[str | None, MAIN] = None
-    """osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder"""
-    out: Annotated[Path | None, MAIN] = None
-    """where to write"""
-    resume: Annotated[bool, MAIN] = False
-    """go on with the recording in --out, or add policies, repeats or an encoder's contexts to it"""
-    workers: Annotated[Count, MAIN] = 2
-    """processes; the result does not depend on how many"""
-    until_decided: Annotated[bool, STOPPING] = False
-    """stop as soon as every two policies are told apart, or the second is no worse than the first by --margin"""
-    margin: Annotated[float, Ge(0.0), Le(0.99), STOPPING] = 0.05
-    """with --until-decided: how much lower success may be to count as no worse; 0.05 is 5 points, 0 asks which is better"""
-    baseline: Annotated[Folder | None, STOPPING] = None
-    """with --until-decided: log to compare with; without --task, its instances are taken"""
-    baseline_policy: Annotated[str | None, STOPPING] = None
-    """policy of --baseline, where that has several (default: the one that is recorded)"""
-    start_seed: Annotated[Index, INSTANCES] = 0
-    """seed of the first instance"""
 
 
 def record(config: RecordConfig | None = None, /, **values: Any) -> RecordResult:
@@ -107,6 +72,7 @@ def _record(config: RecordConfig, folder: Path, baseline: "LoggedOutcomes | None
     from osel_sim.remote.policy import check_servers
 
     plan = _plan(config)
+    check_moments(plan)
     configuration = _configuration(config, plan)  # refuses an unknown level or axis before anything loads
     before = read_run(folder) if config.resume and (folder / RUN).exists() else None
     stop = None
@@ -196,6 +162,7 @@ def _plan(config: RecordConfig) -> "Plan":
         repeat_every=config.repeat_every or 1,
         axes=parse_axes(config.axis, known_axes(tasks)),
         action_noise=config.action_noise,
+        cuts=cuts_of(config),
     )
 
 
@@ -216,6 +183,7 @@ def _configuration(config: RecordConfig, plan: "Plan") -> dict[str, Any]:
         "action_noise": config.action_noise,
         "split": config.split,
         "content": content_digests(plan.tasks, plan.everyone),
+        **said_of(plan.cuts),
     }
 
 
@@ -243,6 +211,7 @@ def _as_begun(config: RecordConfig, given: Set[str]) -> RecordConfig:
         values["policies"] = tuple(dict.fromkeys([*began["policies"], *(config.policies or ())]))
         values["encoder"] = config.encoder or began["encoder"].partition("@")[0]
         values |= {name: getattr(config, name) or began[name] for name in ("repeats", "repeat_every")}
+        values |= moments_as_begun(config, given, began, folder / RUN)
         if "until_decided" in began:
             values |= {"until_decided": True, "baseline": config.baseline or baseline_then(run.get("settings"), folder)}
             values |= {"baseline_policy": began["until_decided"].get("baseline_policy"), "margin": began["until_decided"]["margin"]}
@@ -314,6 +283,8 @@ def _record_missing(recording: "Recording", workers: int, stop: "UntilDecided | 
     plan, missing = recording.plan, recording.missing()
     if stop is not None:
         missing = {key: missing[key] for key in stop.order if key in missing}
+    if plan.cuts is not None:
+        missing = {key: missing[key] for key in in_blocks(missing, plan)}
     total, left = sum(len(plan.episodes(instance)) for instance in plan.instances), sum(map(len, missing.values()))
     unit = "episode" if left else "context"
     logger.info("starting %d workers: they load the encoder%s ...", workers, ", policies and servers" if left else "")

@@ -6,12 +6,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
-from osel_sim.api.results import ReplayResult
+from osel_sim.api.replay_settings import ReplayConfig, choose_selectors
+from osel_sim.api.results import MomentsResult, ReplayResult
 from osel_sim.api.reward import weights_of
-from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, NonNegative, settings
-from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.core.errors import DataError, SettingError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.encoder_choice import EncoderChoice
@@ -29,55 +29,6 @@ SOONEST = ("auto", "linucb")
 """Selectors that are replayed first: they take seconds where PPO takes minutes, and the verdict hardly ever changes with the others."""
 
 
-@settings
-class ReplayConfig(LoggedRewardSettings):
-    """Replay a rollout log to selectors: how far from the oracle is each, and is routing worth it?"""
-
-    log: Folder
-    """folder of a rollout log, or of a live run"""
-    selectors: Annotated[Names | None, MAIN] = None
-    """ppo, ucb1, auto ... (default: all there are)"""
-    policies: Annotated[Names | None, MAIN] = None
-    """policies to choose from (default: all of the log)"""
-    seeds: Annotated[Count, MAIN] = 20
-    """number of random orders"""
-    decisions: Annotated[Count | None, MAIN] = None
-    """length of a stream (default: all instances)"""
-    half: Annotated[Literal["choose", "score"] | None, MAIN] = None
-    """only this half of the instances: one to choose settings by, the other to report (default: all)"""
-    out: Annotated[Path | None, MAIN] = None
-    """where to write (default: runs/replay-LOG)"""
-    overwrite: Annotated[bool, MAIN] = False
-    """replace a replay that is in --out"""
-    open: Annotated[bool, MAIN] = False
-    """write its page too and show it in the browser, as soon as there is a verdict; reload it as more is replayed"""
-    workers: Annotated[Count, MAIN] = 2
-    """processes; the result does not depend on how many"""
-    unknown_costs: Annotated[bool, OTHER] = False
-    """let all selectors learn what policies cost (default: auto is told their mean cost)"""
-    unknown_skills: Annotated[bool, OTHER] = False
-    """do not tell auto what policies were made for (default: it is told what the log says of it)"""
-    no_frontier: Annotated[bool, OTHER] = False
-    """do not replay selectors at other weights of time and price as well"""
-    margin: Annotated[NonNegative, OTHER] = 0.02
-    """a gain in reward a decision that is not worth routing for"""
-    route_with: Annotated[Names | None, OTHER] = None
-    """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
-    encoder: Annotated[str | None, OTHER] = None
-    """whose contexts, where the log has several, or auto: those that predict rewards best, by the choosing half (default: the one it was recorded
-    with)"""
-    targets: Annotated[Files, OTHER] = ()
-    """of a live run or logged decisions: tables of how you would choose (columns policy, probability, and decision or instance); what each would have
-    earned is estimated too"""
-    context: Annotated[Literal["task"] | None, OTHER] = None
-    """append the task's name to the contexts; auto finds out whether it helps"""
-
-    @property
-    def folder(self) -> Path:
-        """Where to write."""
-        return self.out or Path("runs") / f"replay-{self.log.resolve().name}"
-
-
 def replay(
     log: "Path | str | ReplayConfig",
     *,
@@ -85,7 +36,7 @@ def replay(
     targets: "Mapping[str, Target] | Sequence[Path | str] | Path | str | None" = None,
     on_result: Callable[[ReplayResult], None] | None = None,
     **values: Any,
-) -> ReplayResult:
+) -> ReplayResult | MomentsResult:
     """Show a log's instances in random orders to selectors, each of which sees only the outcome of its choice.
 
     Args:
@@ -97,9 +48,13 @@ def replay(
             frontier. What is yet to come, `ReplayResult.pending` says.
         values: settings by name, as `ReplayConfig` has them.
 
+    Returns:
+        what came of it; of the folder of a table of moments (`record --moments`), monitors and start selectors compared.
+
     Raises:
         OselError: whatever is wrong with the settings or the log; the message says what.
     """
+    from osel_sim.api.replay_moments import has_moments, replay_moments
     from osel_sim.interface.selector import factory_name
 
     factories: dict[str, SelectorFactory] = {}
@@ -112,6 +67,10 @@ def replay(
     if targets is not None and not isinstance(targets, Mapping):
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
+    if has_moments(config.log):
+        return replay_moments(config)
+    if config.monitors:
+        raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
     return _Replay(config, factories, functions, on_result).execute()
 
 
@@ -130,6 +89,7 @@ class _Replay:
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
         from osel_sim.analysis.logged_choices import choices_of, has_choices
+        from osel_sim.api.replay_changes import check_all_outcomes
         from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
 
         config, folder = self.config, self.config.folder
@@ -154,6 +114,7 @@ class _Replay:
             live = read_live(config.log, config.encoder)
             weights, preset = weights_of(config, recorded=live.reward)
         found = self._off_policy(live, weights)
+        check_all_outcomes(config, live.has_all_outcomes(weights))
         if live.has_all_outcomes(weights):
             return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
         write_off_policy(folder, found)
@@ -172,6 +133,7 @@ class _Replay:
         from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import Question, build, tables, with_fixed
+        from osel_sim.api.replay_changes import changes_asked, replay_changes
         from osel_sim.core.progress import progress
         from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
 
@@ -180,6 +142,10 @@ class _Replay:
             log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
+        if changes_asked(config):
+            return replay_changes(
+                *(config, log, setup(weights), selectors, left_out, preset, self.factories), lambda done: self._tell(done, config.folder, True)
+            )
         here, question = setup(weights), Question(config.margin, config.half is not None, config.route_with)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
         stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
@@ -307,38 +273,3 @@ def _told(setup: "Setup") -> dict[str, Any]:
         "expected_costs": next((dict(settings[COSTS]) for settings in told if COSTS in settings), None),
         "skills": None if skills is None else {policy: list(names) for policy, names in skills.able.items()},
     }
-
-
-def choose_selectors(names: Sequence[str] | None, halved: bool = False) -> list[str]:
-    """Names of selectors to replay: those given, each once, else all that are installed. Fixed policies are left out: they are always added.
-
-    Args:
-        halved: whether there is another half of the log, whose outcomes a selector named `NAME:warm` is shown.
-
-    Raises:
-        UnknownNameError: no such selector.
-        UsageError: it needs a package that is not installed, or cannot start warm.
-    """
-    from osel_sim.analysis.engine import WARM
-    from osel_sim.analysis.result import REFERENCES
-    from osel_sim.analysis.warm_start import check_can_start_warm
-    from osel_sim.selection.registry import selector_locations
-    from osel_sim.selection.vowpal import available
-
-    locations = selector_locations()
-    if names is None:
-        # `auto` is another name of one of them, which need not run twice.
-        twins = {name for name, place in locations.items() if place == locations.get("auto") and name != "auto"}
-        names = sorted(name for name in locations if name not in twins and (available() or not name.startswith("vw_")))
-        names += [f"auto{WARM}"] if halved else []
-    for name in names:
-        kind = name.partition(":")[0]
-        if kind not in locations and name not in REFERENCES:
-            raise UnknownNameError("selector", name, {*locations, *REFERENCES} - {"fixed"})
-        if name.startswith("vw_") and not available():
-            raise UsageError(f"selector {name!r} needs the package vowpalwabbit: pip install 'osel-sim[vw]'")
-        if name.endswith(WARM) and kind != "fixed":
-            if not halved:
-                raise UsageError(f"selector {name!r} is shown the outcomes of the log's other half beforehand: say which half to replay with --half")
-            check_can_start_warm(kind)
-    return [name for name in dict.fromkeys(names) if name.partition(":")[0] != "fixed" and name not in REFERENCES]

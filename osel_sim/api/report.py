@@ -131,6 +131,7 @@ def _is_finished_log(folder: Path) -> bool:
 def _page(config: ReportConfig) -> "Page":
     from osel_sim.formats.compare_result import COMPARE
     from osel_sim.formats.journal import JOURNAL
+    from osel_sim.formats.moments_result import MOMENTS_RESULT
     from osel_sim.formats.replay_result import REPLAY
     from osel_sim.formats.rollout_log import ROLLOUTS
     from osel_sim.formats.shards import SHARDS
@@ -164,6 +165,10 @@ def _page(config: ReportConfig) -> "Page":
         from osel_sim.reporting.replay_page import ReplayOptions, replay_page
 
         return replay_page(folder, ReplayOptions(config.log, draw))
+    if (folder / MOMENTS_RESULT).is_file():
+        from osel_sim.reporting.moments_page import moments_page
+
+        return moments_page(folder)
     if (folder / COMPARE).is_file():
         from osel_sim.reporting.compare_page import compare_page
 

@@ -147,6 +147,39 @@ class ReplayResult:
 
 
 @dataclass(frozen=True)
+class MomentsResult:
+    """What came of a replay of a table of moments.
+
+    Attributes:
+        folder: where everything lies that it wrote.
+        result: as `moments.json` has it.
+    """
+
+    folder: Path
+    result: Mapping[str, Any]
+
+    @property
+    def verdict(self) -> str:
+        """Whether to hand over, in words."""
+        return str(self.result["verdict"]["headline"])
+
+    @cached_property
+    def arms(self) -> "pandas.DataFrame":
+        """A row for each start selector with each monitor."""
+        return self._table("arms")
+
+    @cached_property
+    def gains(self) -> "pandas.DataFrame":
+        """A row a task, first policy, second policy and decision point: what handing over there gains."""
+        return self._table("gains")
+
+    def _table(self, name: str) -> "pandas.DataFrame":
+        from osel_sim.analysis.moment_tables import tables
+
+        return frame(tables(self.result)[name])
+
+
+@dataclass(frozen=True)
 class CompareResult:
     """What came of a comparison.
 

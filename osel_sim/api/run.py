@@ -16,10 +16,13 @@ from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.episodes.changes import PolicyChanges
     from osel_sim.episodes.live import LiveRun
     from osel_sim.episodes.run_subscribers import RunSubscriber
+    from osel_sim.formats.policy_changes import PolicyChange
     from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.interface.encoder import Encoder
+    from osel_sim.interface.monitor import MonitorFactory
     from osel_sim.interface.policy import Policy
     from osel_sim.interface.selector import Selector, SelectorFactory
     from osel_sim.interface.suite import Task
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
     from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | SelectorFactory
+    MonitorLike = str | MonitorFactory
 
 logger = logging.getLogger(__name__)
 
@@ -38,6 +42,7 @@ def run(
     *,
     policies: "Sequence[str | Policy | PolicyObject] | None" = None,
     selector: "SelectorLike | None" = None,
+    monitor: "MonitorLike | None" = None,
     subscribers: "Sequence[RunSubscriber]" = (),
     **values: Any,
 ) -> RunResult:
@@ -47,6 +52,7 @@ def run(
         config: settings as one object; `values` change some of them.
         policies: names of policy files, or objects with `reset` and `act` (`osel_sim.as_policy` says what they are shown and cost).
         selector: name of a selector, or a class or function of one's own: called with the policies' names, the context's length and the seed.
+        monitor: name of a monitor, or a class or function of one's own (`osel_sim.interface.monitor.MonitorFactory`).
         subscribers: what else watches the run (`osel_sim.episodes.run_subscribers`), beside progress, timings, TensorBoard and the page.
         values: settings by name, as `RunConfig` has them.
 
@@ -63,13 +69,17 @@ def run(
     if selector is not None:
         values["selector"] = selector if isinstance(selector, str) else factory_name(selector)
         factory = None if isinstance(selector, str) else selector
+    watch = None
+    if monitor is not None:
+        values["monitor"] = monitor if isinstance(monitor, str) else factory_name(monitor)
+        watch = None if isinstance(monitor, str) else monitor
     config = RunConfig.of(**values) if config is None else config.changed(**values)
     if config.resume and not config.task and config.out is not None:
         from osel_sim.api.run_resume import settings_then
 
         config = config.of(**settings_then(config.out) | {name: getattr(config, name) for name in config.given})
     with trusting(config.trust):
-        return _Run(config, objects, factory, subscribers).execute()
+        return _Run(config, objects, factory, subscribers, watch).execute()
 
 
 class _Run:
@@ -79,6 +89,7 @@ class _Run:
         objects: policies that no file describes.
         factory: makes the selector where it is none of the registry's.
         watchers: subscribers of the caller's own.
+        monitor: makes the monitor where it is none of the registry's.
     """
 
     def __init__(
@@ -87,23 +98,31 @@ class _Run:
         objects: "Mapping[str, PolicyObject]",
         factory: "SelectorFactory | None",
         watchers: "Sequence[RunSubscriber]",
+        monitor: "MonitorFactory | None" = None,
     ) -> None:
         from osel_sim.api.reward import weights_of
+        from osel_sim.api.run_changes import plan
+        from osel_sim.api.run_monitor import check_monitor
+        from osel_sim.api.run_resume import policies_then
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
         from osel_sim.formats.levels import parse_axes
         from osel_sim.suites.registry import common_specification, known_axes, select_tasks
 
-        self.config, self.objects, self.factory, self.watchers = config, objects, factory, watchers
+        self.config, self.objects, self.factory, self.watchers, self.monitor = config, objects, factory, watchers, monitor
         if config.tensorboard:
             from osel_sim.episodes.tensorboard import check_installed
 
             check_installed()
         self.tasks = select_tasks(config.task, config.tasks, config.robot)
         self.environment = common_specification(self.tasks)
-        self.policies = choose_policies(config.policies, self.environment, config.policies_dir, objects)
+        names = policies_then(config.folder) if config.policies is None and config.resume else config.policies
+        self.policies = choose_policies(names, self.environment, config.policies_dir, objects)
         self.everyone = with_fallbacks(self.policies, config.policies_dir)
+        self.plan = plan(config, self.policies, self.environment, objects)
+        self.driving = with_fallbacks(self.plan.driving, config.policies_dir) if self.plan.changes else self.everyone
         self.weights = weights_of(config)[0]
         self._check_selector()
+        check_monitor(config, monitor, self.policies)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
@@ -124,13 +143,14 @@ class _Run:
         if then is not None and then < config.episodes:  # decisions do not depend on how many follow
             self.grown_from, configuration["episodes"] = then, then
         check_run_folder(folder, configuration, config.resume)
-        check_servers(self.everyone, self.environment)
+        check_servers(self.driving, self.environment)
         with contextlib.ExitStack() as holding:
             if config.resume:
                 holding.enter_context(held(folder))
             return self._run(folder, configuration, holding)
 
     def _run(self, folder: Path, configuration: dict[str, Any], holding: contextlib.ExitStack) -> RunResult:
+        from osel_sim.api.run_monitor import start_monitor_warm
         from osel_sim.context.encoder import load_encoder
         from osel_sim.context.names import DEFAULT_ENCODER
         from osel_sim.formats.journal import JOURNAL
@@ -151,8 +171,8 @@ class _Run:
         with contextlib.ExitStack() as stack:
             stack.enter_context(threads(1))
             selector = self._selector(encoder, configuration)
-            logger.info("%s: loading %s, starting servers ...", title(self.tasks), ", ".join(spec.name for spec in self.everyone))
-            drivers = stack.enter_context(Drivers(self.everyone, self.environment, self.objects))
+            logger.info("%s: loading %s, starting servers ...", title(self.tasks), ", ".join(spec.name for spec in self.driving))
+            drivers = stack.enter_context(Drivers(self.driving, self.environment, self.objects))
             # Only now, when all that could be missing is there, is the folder taken into use, and given back where not even one decision comes of it.
             if not config.resume:
                 holding.enter_context(taken(folder, (JOURNAL,)))
@@ -162,7 +182,9 @@ class _Run:
             stack.callback(live.close)
             if seen is not None:
                 self._start_warm(live, seen)
+            start_monitor_warm(config, live, self.grown_from)
             live.replay()
+            self._write_changes(folder)
             if self.grown_from is not None:
                 note_growth(folder, config.episodes)
             with _Interrupt() as interrupt:
@@ -189,6 +211,7 @@ class _Run:
 
     def _configuration(self) -> dict[str, Any]:
         """Everything the journal depends on but the encoder, content of files included."""
+        from osel_sim.api.run_monitor import monitor_said
         from osel_sim.core.files import digest
         from osel_sim.formats.rollout_log import ROLLOUTS
         from osel_sim.formats.run_config import content_digests, robots_said
@@ -209,6 +232,7 @@ class _Run:
             "reward": asdict(self.weights),
             "counterfactual": config.counterfactual,
             **({"context": config.context} if config.context else {}),
+            **monitor_said(config),
             "content": {**content_digests(self.tasks, self.everyone), **warm},
         }
 
@@ -227,6 +251,30 @@ class _Run:
             known |= wanted_of(self.config.selector, {"parts": parts})
         return make_selector(self.config.selector, names, sum(parts), self.config.seed, **known)
 
+    def _changes(self, encoder: "Encoder", selector: "Selector") -> "PolicyChanges":
+        """The changes of the run, with what the selector is told of policies when they join."""
+        from osel_sim.episodes.changes import PolicyChanges
+        from osel_sim.selection.changing import changing
+
+        changes = self.plan.changes
+        if changes:
+            changing(selector, any(change.event == "retire" for change in changes))
+
+        def told(change: "PolicyChange") -> dict[str, Any]:
+            known = self.factory is None and change.event == "add"
+            return _declared(self.config, self.tasks, self.plan.known_at(change), self.weights, encoder) if known else {}
+
+        return PolicyChanges(changes, tuple(map(told, changes)))
+
+    def _write_changes(self, folder: Path) -> None:
+        """Write down what the selector has been through, before a decision is made by it."""
+        from osel_sim.formats.policy_changes import note_changes, write_changes
+
+        if self.plan.asked:
+            write_changes(folder, self.plan.changes)
+        elif self.plan.made:
+            note_changes(folder, self.plan.made)
+
     def _log(self, folder: Path, encoder: str) -> "LoggedOutcomes":
         """The rollout log of a warm start."""
         from osel_sim.analysis.log import read_log
@@ -235,13 +283,16 @@ class _Run:
         return log.with_tasks() if self.config.context else log
 
     def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
+        from osel_sim.api.run_monitor import make_run_monitor
         from osel_sim.episodes.live import LiveOptions, LiveRun
 
         config = self.config
         options = LiveOptions(
-            config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context
+            *(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context),
+            changes=self._changes(encoder, selector),
         )
-        return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder))
+        monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
+        return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder), monitor)
 
     def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
         """What watches the run."""

@@ -11,6 +11,8 @@ logger = logging.getLogger(__name__)
 
 def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     """Write them. Returns the summary, empty where no decision was made."""
+    from statistics import mean
+
     from osel_sim.core.files import write_json
     from osel_sim.formats.summary import SUMMARY, summarise
     from osel_sim.selection.state import save_state
@@ -18,11 +20,15 @@ def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     if not live.decisions:
         logger.warning("no decision was made")
         return {}
-    policies = live.selector.policies
+    policies = live.policies
     chosen = [policies.index(decision.policy) for decision in live.decisions]
     summary = {"task": title, **summarise(live.decisions, policies, selector)}
     if live.options.counterfactual:
         summary |= _comparison(live, chosen)
+    both = [(decision.reward, alone) for decision, alone in zip(live.decisions, live.alone, strict=False)]
+    known = [(reward, alone) for reward, alone in both if reward is not None and alone is not None]
+    if known:
+        summary["monitor"] |= {"compared_decisions": len(known), "with": mean([one for one, _ in known]), "without": mean([one for _, one in known])}
     write_json(live.folder / SUMMARY, summary)
     if hasattr(live.selector, "state_dict"):  # a selector of one's own need only choose and learn; a resumed run learns from the journal anyway
         save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
@@ -35,7 +41,7 @@ def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:
 
     from osel_sim.selection.oracle import compare
 
-    rewards, policies = live.rewards, live.selector.policies
+    rewards, policies = live.rewards, live.policies
     complete = np.isfinite(rewards).all(axis=1)
     if not complete.any():
         return {}

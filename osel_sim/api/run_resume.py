@@ -22,6 +22,15 @@ def settings_then(folder: Path) -> dict[str, Any]:
     return began
 
 
+def policies_then(folder: Path) -> list[str] | None:
+    """Names of the policies that the run in a folder began with: whatever fits its tasks by now does not join unasked. None where it does not say."""
+    from osel_sim.formats.run_config import RUN, read_run
+    from osel_sim.formats.values import NAME
+
+    names = read_run(folder)["configuration"].get("policies") if (folder / RUN).is_file() else None
+    return names if isinstance(names, list) and all(map(NAME.fits, names)) else None
+
+
 def episodes_then(folder: Path) -> int | None:
     """How many decisions the run in a folder was to have; None where there is none that says so."""
     from osel_sim.formats.run_config import RUN, read_run

@@ -43,6 +43,10 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """where to write (default: runs/TASK-SELECTOR-sSEED)"""
     resume: Annotated[bool, MAIN] = False
     """go on with the run in --out; alone with the settings that it began with, and with --episodes to more decisions than it was to have"""
+    add_policies: Annotated[Names, MAIN] = ()
+    """with --resume: policies that join the run where it goes on; what the selector learned of the others stays"""
+    retire: Annotated[Names, MAIN] = ()
+    """with --resume: policies that are not chosen any more from where the run goes on"""
     counterfactual: Annotated[bool, MAIN] = False
     """run the other policies as well, from the same state, to compare (nothing is learnt from them)"""
     video: Annotated[Index, OUTPUT] = 0
@@ -57,13 +61,20 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """sleep so that the robot moves in real time"""
     warm_start: Annotated[Folder | None, OTHER] = None
     """rollout log whose outcomes the selector is shown first (auto, linucb, thompson ...)"""
+    monitor: Annotated[str | None, OTHER] = None
+    """who drives on within an episode is decided by: value, blind:K:TO, stall, random:P ... (--list)"""
+    decide_every: Annotated[Count, OTHER] = 4
+    """with --monitor: a decision point is every so many calls"""
+    monitor_warm_start: Annotated[Folder | None, OTHER] = None
+    """log with a table of moments (record --moments) that the monitor is shown first (value)"""
 
     @property
     def folder(self) -> Path:
         """Where to write."""
         tasks = "-".join(name.replace(":", "-").replace("/", "-") for name in self.task)
         robot = f"-{self.robot}" if self.robot else ""
-        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}-s{self.seed}{robot}"
+        monitor = f"-{self.monitor.replace(':', '-')}" if self.monitor else ""
+        return self.out or Path("runs") / f"{tasks}-{self.selector.replace(':', '-')}{monitor}-s{self.seed}{robot}"
 
     @property
     def filmed(self) -> frozenset[int]:

@@ -17,6 +17,7 @@ from osel_sim.formats.task_file import TaskSpec, load_task_file
 from osel_sim.interface.instance import OURS
 from osel_sim.interface.robot import DEFAULT_ROBOT
 from osel_sim.selection import registry as selectors
+from osel_sim.selection.monitors import registry as monitors
 from osel_sim.selection.weights import PRESETS
 from osel_sim.sim.robots import ROBOTS
 from osel_sim.suites import SUITES
@@ -26,7 +27,7 @@ MOST_TASKS = 12
 
 
 def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str, list[dict[str, Any]]]:
-    """All tasks, robots, policies, suites of others, selectors, encoders and reward presets, by name, as plain data.
+    """All tasks, robots, policies, suites of others, selectors, monitors, encoders and reward presets, by name, as plain data.
 
     Args:
         tasks: a folder of the user's own task files.
@@ -41,6 +42,7 @@ def listing(tasks: Path | None = None, policies: Path | None = None) -> dict[str
         "policies": [_policy(load_policy_file(file)) for _, file in sorted(content.files("policies", policies).items())],
         "suites": [_suite(name) for name in SUITES if name != OURS],
         "selectors": [{"name": name, "about": selectors.ABOUT.get(name, f"of another package ({place})")} for name, place in _selectors()],
+        "monitors": [{"name": name, "about": monitors.ABOUT.get(name, f"of another package ({place})")} for name, place in _monitors()],
         "encoders": [{"name": name, "about": about} for name, about in _encoders()],
         "presets": [{"name": name, **asdict(weights)} for name, weights in PRESETS.items()],
     }
@@ -76,7 +78,12 @@ def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Pa
         where = "local" if policy["remote"] is None else f"remote ({policy['remote']['network']})"
         table.add(policy["name"], policy["title"], where + (", privileged" if policy["privileged"] else ""), policy["kind"])
     console().print(table)
-    for things, heading in (("selectors", "Selectors, for --selector"), ("encoders", "Encoders of contexts, for --encoder")):
+    headings = {
+        "selectors": "Selectors, for --selector",
+        "monitors": "Who drives on within an episode, for --monitor",
+        "encoders": "Encoders of contexts, for --encoder",
+    }
+    for things, heading in headings.items():
         table = Table(heading, ("name", "what it is"))
         for thing in found[things]:
             table.add(thing["name"], thing["about"])
@@ -94,6 +101,11 @@ def print_listing(as_json: bool = False, tasks: Path | None = None, policies: Pa
 def _selectors() -> list[tuple[str, str]]:
     """Name and place of each, the recommended one first."""
     return sorted(selectors.selector_locations().items(), key=lambda item: (item[0] != selectors.RECOMMENDED, item[0]))
+
+
+def _monitors() -> list[tuple[str, str]]:
+    """Name and place of each."""
+    return sorted(monitors.monitor_locations().items())
 
 
 def _encoders() -> list[tuple[str, str]]:

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from osel_sim.context.appended import name_part
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
+from osel_sim.episodes.changes import PolicyChanges
 from osel_sim.episodes.drivers import Drivers
 from osel_sim.episodes.loop import run_episode
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
 from osel_sim.episodes.view import view
+from osel_sim.episodes.watching import RunMonitor
 from osel_sim.formats.counterfactual import COUNTERFACTUAL, Others, to_others
 from osel_sim.formats.journal import (
     JOURNAL,
@@ -31,6 +33,7 @@ from osel_sim.formats.journal import (
     read_lines,
     to_decision,
 )
+from osel_sim.formats.points import POINTS
 from osel_sim.formats.summary import check_summary
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.instance import Instance
@@ -52,6 +55,7 @@ class LiveOptions:
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
         context: `task` appends the task's name to the contexts that the selector is shown.
+        changes: policies that join and leave.
     """
 
     seed: int
@@ -62,6 +66,7 @@ class LiveOptions:
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
     context: str | None = None
+    changes: PolicyChanges = field(default_factory=PolicyChanges)
 
 
 class LiveRun:
@@ -70,11 +75,14 @@ class LiveRun:
     What the folder holds is looked at before any of it is changed.
 
     Args:
-        subscribers: watch it (`osel_sim.episodes.run_subscribers`); the run itself writes its journal, counterfactual outcomes and contexts only.
+        subscribers: watch it (`osel_sim.episodes.run_subscribers`); the run itself writes its journal, counterfactual outcomes, contexts, and what a
+            monitor saw.
+        monitor: says who drives on within the chosen policies' episodes.
 
     Attributes:
         decisions: all so far.
         rewards: of every policy (columns) in every decision (rows), NaN where there is none; only chosen ones without `counterfactual`.
+        alone: with `counterfactual` and a monitor, what each chosen policy comes to without it; None after an error.
 
     Raises:
         DataError: the folder's files are damaged, or do not fit together.
@@ -89,10 +97,11 @@ class LiveRun:
         selector: Selector,
         options: LiveOptions,
         subscribers: Sequence[RunSubscriber] = (),
+        monitor: RunMonitor | None = None,
     ) -> None:
         self.folder, self.tasks, self.encoder = folder, tasks, encoder
         self.drivers, self.selector, self.options = drivers, selector, options
-        self.subscribers = subscribers
+        self.subscribers, self.monitor = subscribers, monitor
         # Contexts are on disk about as soon as their decisions: a run that goes on, or was killed, can be reported on.
         self.envs, self.cache = OpenTasks(tasks), ContextCache(folder, autosave=1, mend=True)
         self.decisions = [to_decision(data, index, folder / JOURNAL) for index, (data, _) in enumerate(read_lines(folder / JOURNAL))]
@@ -101,21 +110,27 @@ class LiveRun:
         check_summary(folder, len(self.decisions))
         for name in (JOURNAL, COUNTERFACTUAL):
             check_digests(folder / name)
+        if monitor is not None:
+            monitor.open(folder, len(self.decisions))
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
-        self._rows: list[list[float]] = []
+        self._ever = tuple(selector.policies)
+        self._rows: list[dict[str, float | None]] = []
+        self.alone: list[float | None] = []
+        self._horizons = {task.name: max(1, task.info.horizon) for task in tasks}
         # A journal begun by a version that did not tell scenes stays as it would have been.
         self._tells_scenes = not self.decisions or self.decisions[0].scene is not None
 
     @property
     def policies(self) -> Sequence[str]:
-        """Names of the policies that are chosen from."""
-        return self.selector.policies
+        """Names of the policies that were ever chosen from; `selector.policies` are those that are now."""
+        return self._ever
 
     @property
     def rewards(self) -> NDArray[np.float64]:
-        """(decisions, policies), in the order of the selector's policies."""
-        return np.array(self._rows, np.float64).reshape(-1, len(self.policies))
+        """(decisions, policies), in the order of `policies`."""
+        table = [[float("nan") if (value := row.get(policy)) is None else value for policy in self._ever] for row in self._rows]
+        return np.array(table, np.float64).reshape(-1, len(self._ever))
 
     def run(self, decisions: int, stop: Callable[[], bool] = lambda: False) -> None:
         """Make decisions until there are so many, or `stop` says so. The run is closed then; its subscribers are told of all of it.
@@ -129,18 +144,20 @@ class LiveRun:
             with contextlib.closing(self):
                 for subscriber in self.subscribers:
                     subscriber.on_start(self)
+                self._tell_changes(len(self.decisions))
                 while len(self.decisions) < decisions and not stop():
                     self.decide()
             for subscriber in self.subscribers:
                 subscriber.on_end(self)
 
     def replay(self) -> None:
-        """Let the selector live through the journal, so that it is what it was when the run was cut off.
+        """Let the selector live through the journal, so that it is what it was when the run was cut off, and through what changes right after it.
 
         Raises:
             DataError: the selector decides otherwise than the journal says, or a line is not of the run's instance, or its reward is wrong.
         """
         for decision in self.decisions:
+            self._change(decision.index)
             instance = self._instance(decision.index)
             self._check(decision, instance)
             context = self._context(instance, loaded=False)
@@ -151,11 +168,15 @@ class LiveRun:
                     f"{choice.policy!r} with {choice.propensities}: the run was made with other versions or on another machine"
                 )
             self._learn(context, choice, decision.reward)
+            if self.monitor is not None:
+                self.monitor.replay(decision)
             known = {decision.policy: decision.reward}
             if self._others is not None:
                 others = self._checked_others(self._others.rows[decision.index][0], decision.index, decision.policy)
                 known |= others.rewards
-            self._remember(known)
+                self.alone += [others.alone_reward] if others.alone is not None else []
+            self._rows.append(known)
+        self._change(len(self.decisions))
 
     def decide(self) -> Decision:
         """Make the next decision and write it down."""
@@ -174,20 +195,29 @@ class LiveRun:
         to_decision(as_read(decision.to_dict(), f"{self._journal.file}, line {index + 1}"), index, self._journal.file)
         rewards, checksums = {choice.policy: decision.reward}, {JOURNAL: line_digest(decision.to_dict())}
         if self._others is not None:
-            found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in self.policies if policy != choice.policy}
-            others = Others(index, found, {policy: self._reward(other) for policy, other in found.items()})
+            rest = [policy for policy in self.selector.policies if policy != choice.policy]
+            found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in rest}
+            others = Others(
+                index, found, {policy: self._reward(other) for policy, other in found.items()}, *self._alone(index, instance, start, choice)
+            )
             rewards |= others.rewards
             self._checked_others(as_read(others.to_dict(), f"{self._others.file}, line {index + 1}"), index, choice.policy)
             self._others.append(others.to_dict())
             checksums[COUNTERFACTUAL] = line_digest(others.to_dict())
+        if self.monitor is not None:
+            checksums[POINTS] = self.monitor.write(decision)
         for subscriber in self.subscribers:
             subscriber.on_decision(decision, rewards)
             subscriber.on_lines(index, checksums)
         # The journal comes last: what it does not have did not happen.
         self._journal.append(decision.to_dict())
         self.decisions.append(decision)
-        self._remember(rewards)
+        self._rows.append(rewards)
         self._learn(context, choice, decision.reward)
+        if self.monitor is not None:
+            self.monitor.learn(decision)
+        if self._change(index + 1):
+            self._tell_changes(index + 1)
         return decision
 
     def instance_keys(self, count: int) -> frozenset[str]:
@@ -198,16 +228,28 @@ class LiveRun:
         """Close the files and the environments, and write the contexts. May be called twice."""
         self.cache.save()
         self.envs.close()
-        for lines in (self._journal, self._others):
+        for lines in (self._journal, self._others, self.monitor):
             if lines is not None:
                 lines.close()
 
     def _episode(self, index: int, instance: Instance, start: Start, policy: str, chosen: bool) -> Outcome:
-        """One policy on the instance, from its beginning."""
+        """One policy on the instance, from its beginning; the chosen one with the monitor."""
         start.again()
         watching = [listener for subscriber in self.subscribers for listener in subscriber.watch(index, policy, chosen)]
         env, fallback = self.envs[instance.task], self.drivers.fallback(policy)
-        return run_episode(env, instance, self.drivers[policy], fallback, watching, action_noise=self.options.action_noise)
+        handoffs = None
+        if chosen and self.monitor is not None:
+            handoffs = self.monitor.handoffs(self.drivers, env.specification.horizon or self._horizons[instance.task])
+            watching.append(self.monitor.watch())
+        return run_episode(env, instance, self.drivers[policy], fallback, watching, action_noise=self.options.action_noise, handoffs=handoffs)
+
+    def _alone(self, index: int, instance: Instance, start: Start, choice: Choice) -> tuple[Outcome, float | None] | tuple[()]:
+        """What the chosen policy comes to without the monitor, with its reward; nothing where there is none."""
+        if self.monitor is None:
+            return ()
+        outcome = self._episode(index, instance, start, choice.policy, chosen=False)
+        self.alone.append(self._reward(outcome))
+        return outcome, self.alone[-1]
 
     def _instance(self, index: int) -> Instance:
         options = self.options
@@ -227,9 +269,11 @@ class LiveRun:
     def _checked_others(self, data: dict[str, Any], index: int, chosen: str) -> Others:
         """A line about the policies that were not chosen."""
         file = self.folder / COUNTERFACTUAL
-        others = to_others(data, index, file, self.policies, chosen)
+        others = to_others(data, index, file, self.selector.policies, chosen)
         for policy, outcome in others.outcomes.items():
             check_reward(others.rewards[policy], outcome, self.options.weights, f"{file}, line {index + 1}: {policy}")
+        if others.alone is not None:
+            check_reward(others.alone_reward, others.alone, self.options.weights, f"{file}, line {index + 1}: alone")
         return others
 
     def _context(self, instance: Instance, loaded: bool) -> NDArray[np.float32]:
@@ -249,9 +293,16 @@ class LiveRun:
         if value is not None:  # an error teaches nothing
             self.selector.update(context, choice, value)
 
-    def _remember(self, rewards: dict[str, float | None]) -> None:
-        row = [rewards.get(policy) for policy in self.policies]
-        self._rows.append([float("nan") if value is None else value for value in row])
+    def _change(self, index: int) -> bool:
+        """Let policies join and leave before a decision. Returns whether any does."""
+        changed = self.options.changes.apply(self.selector, index)
+        self._ever = tuple(dict.fromkeys([*self._ever, *(change.policy for change in changed)]))
+        return bool(changed)
+
+    def _tell_changes(self, index: int) -> None:
+        for change in self.options.changes.made:
+            for subscriber in self.subscribers if change.before == index else ():
+                subscriber.on_event(change)
 
     def _decision(self, index: int, instance: Instance, choice: Choice, outcome: Outcome, scene: str | None) -> Decision:
         own: dict[str, Any] = {key: value for key, value in vars(outcome).items() if key not in ("fallback", "error")}

@@ -1,13 +1,17 @@
 """The progress bar of a live run."""
 
 import contextlib
+import logging
 from collections.abc import Mapping
 from typing import override
 
 from osel_sim.core.progress import Bar, progress
 from osel_sim.episodes.run_subscribers import Run, RunSubscriber
 from osel_sim.formats.journal import Decision
+from osel_sim.formats.policy_changes import PolicyChange
 from osel_sim.interface.outcome import credited
+
+logger = logging.getLogger(__name__)
 
 
 class Progress(RunSubscriber):
@@ -28,6 +32,11 @@ class Progress(RunSubscriber):
     def on_start(self, run: Run) -> None:
         self._policies, self._seen = list(run.policies), list(run.decisions)
         self._bar = self._shown.enter_context(progress(self._total, "episode", initial=len(self._seen)))
+
+    @override
+    def on_event(self, event: PolicyChange) -> None:
+        logger.info("%s", event.words)
+        self._policies = list(dict.fromkeys([*self._policies, event.policy]))
 
     @override
     def on_choice(self, index: int, policy: str) -> None:

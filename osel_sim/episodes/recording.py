@@ -6,6 +6,7 @@ from typing import Any
 
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
+from osel_sim.episodes.moment_recording import MomentRecording
 from osel_sim.episodes.workers import Episode, Plan, Recorded, worker_died
 from osel_sim.formats.rollout_log import DECLARED, ROLLOUTS, Row, read_rollouts, write_rollouts
 from osel_sim.formats.shards import SHARDS, Shards
@@ -35,6 +36,7 @@ class Recording:
         there, metadata = read_rollouts(folder) if (folder / ROLLOUTS).exists() else ([], {})
         self._declared, self._default = metadata.get(DECLARED), metadata.get("encoder")
         self._shards = Shards(folder) if (folder / SHARDS).exists() else None
+        self._moments = MomentRecording(folder) if plan.cuts is not None else None
         in_shards = [row for rows in self._shards.rows.values() for row in rows.values()] if self._shards is not None else []
         for row in [*there, *in_shards]:
             if row.scene is not None:
@@ -86,6 +88,8 @@ class Recording:
                 )
         if self._shards is None:
             self._shards = Shards(self.folder)
+        if self._moments is not None:
+            self._moments.add({(recorded.instance, *episode): moments for episode, moments in recorded.moments.items()})
         self._shards.add(recorded.instance, rows, self.encoder, recorded.context)
         self._rows.setdefault(recorded.instance, {}).update(recorded.rows)
         self.grew = True
@@ -107,9 +111,21 @@ class Recording:
                 self._cache.put_examples(self.encoder, skill, list(examples))
             configuration = configuration | {DECLARED: self._able}
         self._cache.save()
+        if self._moments is not None and self.plan.cuts is not None:
+            episodes = [(key, *episode) for key in self._instances for episode in self.plan.episodes(key)]
+            self._moments.finish(episodes, self.plan.cuts, self._about_moments)
         write_rollouts(self.folder, [self._rows[key][episode] for key in self._instances for episode in self.plan.episodes(key)], configuration)
         shards.close(remove=True)
         self._shards = None
+
+    @property
+    def _about_moments(self) -> dict[str, Any]:
+        policies = self.plan.policies
+        return {
+            "policies": [spec.name for spec in policies],
+            "remote": [spec.name for spec in policies if spec.is_remote],
+            "encoder": self.encoder,
+        }
 
     @property
     def _able(self) -> dict[str, list[str]] | None:

@@ -12,6 +12,7 @@ from osel_sim.episodes.loop import Subscriber
 from osel_sim.episodes.subscribers import RealTime, Timing
 from osel_sim.episodes.video import Video
 from osel_sim.formats.journal import TIMING, Decision, Lines
+from osel_sim.formats.policy_changes import PolicyChange
 
 VIDEOS = "videos"
 
@@ -27,7 +28,7 @@ class Run(Protocol):
 
     @property
     def policies(self) -> Sequence[str]:
-        """Names of the policies that are chosen from."""
+        """Names of the policies that were ever chosen from."""
         ...
 
     @property
@@ -49,6 +50,9 @@ class RunSubscriber:
 
     def on_start(self, run: Run) -> None:
         """The run begins, or goes on after the decisions that its journal has."""
+
+    def on_event(self, event: PolicyChange) -> None:
+        """A policy has joined or left, before the decision that comes next (`osel_sim.formats.policy_changes`)."""
 
     def on_instance(self, index: int) -> None:
         """A decision begins: its instance is about to be loaded."""
@@ -108,8 +112,9 @@ class TimingFile(RunSubscriber):
 
     @override
     def watch(self, index: int, policy: str, chosen: bool) -> Sequence[Subscriber]:
-        self._episodes[policy] = Timing()
-        return [self._episodes[policy]]
+        name = policy if policy not in self._episodes else f"{policy} alone"  # once more, without the monitor
+        self._episodes[name] = Timing()
+        return [self._episodes[name]]
 
     @override
     def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:

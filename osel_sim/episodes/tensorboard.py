@@ -8,6 +8,7 @@ from typing import Any, override
 from osel_sim.core.errors import UsageError
 from osel_sim.episodes.run_subscribers import Run, RunSubscriber
 from osel_sim.formats.journal import Decision
+from osel_sim.formats.policy_changes import PolicyChange
 from osel_sim.interface.outcome import credited
 
 FOLDER = "tensorboard"
@@ -41,6 +42,11 @@ class TensorBoard(RunSubscriber):
         for decision, row in zip(run.decisions, run.rewards.tolist(), strict=True):
             self._add(decision, dict(zip(self._policies, row, strict=True)))
         self._writer.flush()
+
+    @override
+    def on_event(self, event: PolicyChange) -> None:
+        self._policies = list(dict.fromkeys([*self._policies, event.policy]))
+        self._writer.add_text("event", event.words, event.before)
 
     @override
     def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim.core.errors import WorkerError
 from osel_sim.core.processes import Result, Work, run_jobs
+from osel_sim.episodes.moments import Cuts, MomentRunner, Moments
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.interface.instance import Instance
@@ -46,6 +47,7 @@ class Plan:
         encoder: as `load_encoder` takes it.
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
+        cuts: where episodes are cut, to let other policies go on from there; None: nowhere.
     """
 
     tasks: tuple[Task, ...]
@@ -59,6 +61,7 @@ class Plan:
     repeat_every: int = 1
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
+    cuts: Cuts | None = None
 
     @functools.cached_property
     def instances(self) -> dict[str, Instance]:
@@ -75,10 +78,11 @@ class Plan:
 
 @dataclass
 class Recorded:
-    """One instance with the episodes asked for. `context` is None if the worker died before it was made."""
+    """One instance with the episodes asked for. `context` is None if the worker died before it was made; without cuts there are no moments."""
 
     instance: str
     rows: dict[Episode, Row] = field(default_factory=dict)
+    moments: dict[Episode, Moments] = field(default_factory=dict)
     context: "NDArray[np.float32] | None" = None
 
 
@@ -123,7 +127,9 @@ def record(
             else:
                 policy, repeat = job.episodes[event.index - 1]
                 if isinstance(event, Result):
-                    recorded.rows[policy, repeat], made = event.value, made + 1
+                    recorded.rows[policy, repeat], moments = event.value
+                    recorded.moments |= {(policy, repeat): moments} if moments is not None else {}
+                    made += 1
                 else:
                     cause = event.cause
                     recorded.rows[policy, repeat] = error_row(plan, job.instance, policy, repeat, f"{WORKER_DIED} ({cause})")
@@ -147,9 +153,12 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
     encoder, drivers = load_encoder(plan.encoder), Drivers(plan.everyone, common_specification(plan.tasks))
     if "torch" in sys.modules:  # importing it takes longer than an episode, and not every encoder and policy needs it
         sys.modules["torch"].set_num_threads(1)  # workers share the cores, and results must not depend on how many there are
-    envs = OpenTasks(plan.tasks, keep=KEPT_OPEN)  # work comes task by task
+    envs = OpenTasks(plan.tasks, keep=KEPT_OPEN)  # work comes task by task, or some instances of each in turn
 
-    def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | Row]":
+    horizons = {task.name: max(1, task.info.horizon) for task in plan.tasks}
+    runner = None if plan.cuts is None else MomentRunner(drivers, [spec.name for spec in plan.policies], plan.cuts, encoder, plan.action_noise)
+
+    def work(job: _Job, start: int) -> "Iterator[NDArray[np.float32] | tuple[Row, Moments | None]]":
         instance = plan.instances[job.instance]
         env = envs[instance.task]
         begin = Start(env, instance)
@@ -157,8 +166,12 @@ def _recorder(plan: Plan) -> Work[_Job, Any]:
             yield encoder.encode(view(env, encoder), instance.instruction)
         for policy, repeat in job.episodes[max(0, start - 1) :]:
             begin.again()
+            if runner is not None:
+                outcome, moments = runner.run(env, instance, policy, horizons[instance.task], repeat)
+                yield make_row(instance, policy, repeat, outcome, begin.scene), moments
+                continue
             outcome = run_episode(env, instance, drivers[policy], drivers.fallback(policy), repeat=repeat, action_noise=plan.action_noise)
-            yield make_row(instance, policy, repeat, outcome, begin.scene)
+            yield make_row(instance, policy, repeat, outcome, begin.scene), None
 
     return work
 

@@ -20,16 +20,20 @@ class Others:
     Attributes:
         index: of the decision.
         outcomes, rewards: by policy; no reward where the episode ended in error.
+        alone, alone_reward: of the chosen policy without the monitor that watched it; None where none did.
     """
 
     index: int
     outcomes: dict[str, Outcome]
     rewards: dict[str, float | None]
+    alone: Outcome | None = None
+    alone_reward: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As the file has it."""
         policies = {policy: {**outcome.to_dict(), "reward": self.rewards[policy]} for policy, outcome in self.outcomes.items()}
-        return {"index": self.index, "policies": policies}
+        alone = {} if self.alone is None else {"alone": {**self.alone.to_dict(), "reward": self.alone_reward}}
+        return {"index": self.index, "policies": policies, **alone}
 
 
 def to_others(data: dict[str, Any], index: int, file: Path, policies: Sequence[str], chosen: str) -> Others:
@@ -44,7 +48,7 @@ def to_others(data: dict[str, Any], index: int, file: Path, policies: Sequence[s
         DataError: naming file and line.
     """
     place = f"{file}, line {index + 1}: not outcomes of policies"
-    if data.keys() != {"index", "policies"} or not COUNT.fits(data["index"]) or not isinstance(data["policies"], dict):
+    if data.keys() - {"alone"} != {"index", "policies"} or not COUNT.fits(data["index"]) or not isinstance(data["policies"], dict):
         raise DataError(f"{place} (must have an index and policies, got {quoted(data)})")
     if data["index"] != index:
         raise DataError(f"{file}, line {index + 1}: index must be {index}, got {data['index']}")
@@ -54,11 +58,21 @@ def to_others(data: dict[str, Any], index: int, file: Path, policies: Sequence[s
     outcomes: dict[str, Outcome] = {}
     rewards: dict[str, float | None] = {}
     for policy, values in data["policies"].items():
-        if not isinstance(values, dict):
-            raise DataError(f"{place} ({policy} must be an object, got {quoted(values)})")
-        if problem := fault(values, {**OUTCOME, "reward": NUMBER.or_null}, optional=("fallback_steps",)):
-            raise DataError(f"{place} ({policy}: {problem})")
-        own = {key: value for key, value in values.items() if key != "reward"}
-        outcomes[policy] = Outcome(**{**own, "seconds": Seconds(**own["seconds"])})
-        rewards[policy] = values["reward"]
-    return Others(index, outcomes, rewards)
+        outcomes[policy], rewards[policy] = _outcome(values, policy, place)
+    if "alone" not in data:
+        return Others(index, outcomes, rewards)
+    return Others(index, outcomes, rewards, *_outcome(data["alone"], "alone", place))
+
+
+def _outcome(values: Any, whose: str, place: str) -> tuple[Outcome, float | None]:
+    """An outcome with its reward.
+
+    Raises:
+        DataError: naming the place, and whose it is.
+    """
+    if not isinstance(values, dict):
+        raise DataError(f"{place} ({whose} must be an object, got {quoted(values)})")
+    if problem := fault(values, {**OUTCOME, "reward": NUMBER.or_null}, optional=("fallback_steps",)):
+        raise DataError(f"{place} ({whose}: {problem})")
+    own = {key: value for key, value in values.items() if key != "reward"}
+    return Outcome(**{**own, "seconds": Seconds(**own["seconds"])}), values["reward"]

@@ -21,14 +21,14 @@ from osel_sim.core.shown import escaped
 from osel_sim.formats.toml_types import quoted
 from osel_sim.formats.values import DECISION, fault
 from osel_sim.interface.instance import instance_key, label
-from osel_sim.interface.outcome import Outcome, Seconds
+from osel_sim.interface.outcome import Monitored, Outcome, Seconds
 
 logger = logging.getLogger(__name__)
 JOURNAL, TIMING = "episodes.jsonl", "timing.jsonl"
 LOST = "the journal lost decisions; put it back, or give another folder with --out"
 """What a journal is told that is shorter than what lies beside it."""
 
-OPTIONAL = ("robot", "fallback_steps", "scene")
+OPTIONAL = ("robot", "fallback_steps", "scene", "monitored")
 """Fields of a decision that are not written down where they are None."""
 SEEDS_PER_RUN = 1_000_000
 """Decision t of run seed s is made on the instance of seed s * 1,000,000 + t: no two runs share an instance."""
@@ -44,6 +44,7 @@ class Decision:
         reward: None when the outcome is an error; nothing is learnt from it then.
         robot: the robot's name, None for the usual one: then it is not written down, as `fallback_steps` is not where no fallback took over.
         scene: digest of how the scene was set up, with the instruction; not written down where nobody told.
+        monitored: handoffs, duty and price by policy; not written down where no monitor watched.
         Others: of the instance and of `Outcome`.
     """
 
@@ -72,10 +73,12 @@ class Decision:
     robot: str | None = None
     fallback_steps: int | None = None
     scene: str | None = None
+    monitored: Monitored | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """As the journal has it."""
         data = dataclasses.asdict(self)
+        data["monitored"] = None if self.monitored is None else self.monitored.to_dict()
         return {key: value for key, value in data.items() if value is not None or key not in OPTIONAL}
 
     @property
@@ -91,7 +94,8 @@ class Decision:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Decision":
         """Raises TypeError or KeyError if a field is missing or unknown."""
-        return cls(**{**data, "seconds": Seconds(**data["seconds"])})
+        monitored = {"monitored": Monitored.from_dict(data["monitored"])} if "monitored" in data else {}
+        return cls(**{**data, "seconds": Seconds(**data["seconds"]), **monitored})
 
 
 def to_line(data: dict[str, Any]) -> str:

@@ -18,10 +18,14 @@ from osel_sim.core.csv_text import to_csv
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.core.files import content_digest, is_partial, read_json, write_bytes, write_json
 from osel_sim.core.interrupts import uninterrupted
+from osel_sim.formats.moments_result import MOMENTS_RESULT
 
 SCHEMA_VERSION = 2
 """Version 2 has a verdict of three, with its words; intervals are over units. A replay of version 1 is shown as it was written."""
-READABLE = (1, 2)
+CHANGING_VERSION = 3
+"""Of a replay whose streams change, which has `changes` and no verdict of three."""
+READABLE = (1, 2, CHANGING_VERSION)
+CHANGES = "changes"
 OFF_POLICY_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
 PENDING, FRONTIER = "pending", "frontier"
@@ -70,7 +74,7 @@ def check_replay_folder(folder: Path, overwrite: bool) -> None:
     """
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--out {folder} is a file; give a folder")
-    if (folder / REPLAY).exists() or (folder / OFF_POLICY).exists():
+    if any((folder / name).exists() for name in (REPLAY, OFF_POLICY, MOMENTS_RESULT)):
         if not overwrite:
             raise UsageError(f"--out {folder} holds a replay; add --overwrite to replace it, or give another folder")
     elif folder.exists() and any(not is_partial(item) and item.name != CHOICES for item in folder.iterdir()):

@@ -98,7 +98,7 @@ class Row:
         missing = [name for name in _EPISODE if getattr(self, name) is None]
         if missing:
             raise DataError(f"instance {self.instance!r}, policy {self.policy!r} is no episode in simulation: it has no {', '.join(missing)}")
-        own = {field.name: getattr(self, field.name) for field in fields(Outcome) if field.name != "seconds"}
+        own = {field.name: getattr(self, field.name) for field in fields(Outcome) if field.name not in ("seconds", "monitored")}
         return Outcome(seconds=Seconds(*(getattr(self, field.name) for field in fields(Seconds))), **own)
 
 

@@ -19,12 +19,15 @@ def summarise(decisions: Sequence[Decision], policies: Sequence[str], selector: 
     Returns:
         selector, decisions, errors, fallbacks (episodes in which one took over), solved_by_fallback (those of them that succeeded), mean_reward,
         success_rate (with its 95 % Wilson interval; without what a fallback solved from the first call on), mean_steps, mean_seconds, price (mean, in
-        cents an episode), and under `policies` the same for the decisions each policy was chosen for. A mean over nothing is null.
+        cents an episode), and under `policies` the same for the decisions each policy was chosen for. A mean over nothing is null. Where a monitor
+        watched, under `monitor`: handoffs (mean, an episode), duty_steps and duty_calls (shares of all steps and calls), price_by_policy (mean, in
+        cents an episode).
     """
     return {
         "selector": selector,
         **_part(decisions),
         "policies": {policy: _part([decision for decision in decisions if decision.policy == policy]) for policy in policies},
+        **_monitored(decisions),
     }
 
 
@@ -55,6 +58,28 @@ def _part(decisions: Sequence[Decision]) -> dict[str, Any]:
         "mean_steps": _mean([float(decision.steps) for decision in valid]),
         "mean_seconds": _mean([decision.seconds.motion for decision in valid]),
         "price": _mean([decision.price for decision in valid]),
+    }
+
+
+def _monitored(decisions: Sequence[Decision]) -> dict[str, Any]:
+    """What a monitor made of the decisions; nothing where none watched."""
+    watched = [decision for decision in decisions if decision.monitored is not None and decision.error is None]
+    told = [decision.monitored for decision in watched if decision.monitored is not None]
+    if not told:
+        return {}
+    steps = sum(decision.steps for decision in watched)
+    calls = sum(driving.calls for one in told for driving in one.by_policy.values())
+    drove = sorted({policy for one in told for policy in one.by_policy})
+    prices = {policy: sum(one.by_policy[policy].price for one in told if policy in one.by_policy) / len(told) for policy in drove}
+    duty_steps = sum(one.duty_steps * decision.steps for one, decision in zip(told, watched, strict=True))
+    duty_calls = sum(one.duty_calls * sum(driving.calls for driving in one.by_policy.values()) for one in told)
+    return {
+        "monitor": {
+            "handoffs": _mean([float(len(one.handoffs)) for one in told]),
+            "duty_steps": duty_steps / steps if steps else 0.0,
+            "duty_calls": duty_calls / calls if calls else 0.0,
+            "price_by_policy": prices,
+        }
     }
 
 

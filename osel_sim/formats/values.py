@@ -60,10 +60,34 @@ _USED = {"calls": COUNT, "actions": COUNT, "price": AMOUNT}
 _TOLD = {"fallback": TEXT.or_null, "error": TEXT.or_null, "fallback_steps": COUNT.or_null}
 OUTCOME = {**_END, "seconds": SECONDS, **_USED, **_TOLD}
 """Of `osel_sim.interface.outcome.Outcome`."""
+
+
+def _is_monitored(value: Any) -> bool:
+    if not isinstance(value, dict) or fault(value, _MONITORED) is not None:
+        return False
+    handoffs, by_policy = value["handoffs"], value["by_policy"]
+    return all(isinstance(one, dict) and fault(one, _HANDOFF) is None for one in handoffs) and all(
+        NAME.fits(policy) and isinstance(driving, dict) and fault(driving, _DRIVING) is None for policy, driving in by_policy.items()
+    )
+
+
+_HANDOFF = {"step": COUNT, "call": COUNT, "from": NAME, "to": NAME, "why": TEXT}
+_DRIVING = {"steps": COUNT, **_USED}
+_DUTY = {"steps": SHARE, "calls": SHARE}
+_MONITORED = {
+    "version": Kind("1", lambda value: value == 1 and not isinstance(value, bool)),
+    "points": COUNT,
+    "handoffs": Kind("a list", lambda value: isinstance(value, list)),
+    "duty": Kind("an object of shares", lambda value: isinstance(value, dict) and fault(value, _DUTY) is None),
+    "by_policy": Kind("an object", lambda value: isinstance(value, dict)),
+}
+MONITORED = Kind("version 1 of handoffs, duty and what each policy had of an episode", _is_monitored)
+"""Of `osel_sim.interface.outcome.Monitored`."""
 DECISION = {
     **{"index": COUNT, "task": NAME, "seed": COUNT, "level": COUNT, "axes": NAME.or_null, "split": NAME},
     **{"instruction": TEXT, "phrasing": TEXT, "target": TEXT, "container": TEXT, "policy": NAME, "propensities": PROPENSITIES},
     **{**_END, "seconds": SECONDS, **_USED, "reward": NUMBER.or_null, **_TOLD, "robot": NAME.or_null, "scene": NAME.or_null},
+    "monitored": MONITORED,
 }
 """Of `osel_sim.formats.journal.Decision`."""
 ROW = {

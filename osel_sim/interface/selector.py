@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ class Choice:
 
     Attributes:
         policy: the chosen policy.
-        propensities: probability with which each policy (all of them) would have been chosen; they sum to 1.
+        propensities: probability with which each policy that was available would have been chosen; they sum to 1.
         details: what the selector wants back with `update` (PPO: its value estimate and log probability). Lets several choices be in flight at once.
     """
 
@@ -65,10 +65,29 @@ class Selector(Protocol):
         ...
 
 
+@runtime_checkable
+class Changes(Protocol):
+    """A selector whose policies may come and go while it learns. Optional: a stranger's selector need not be one.
+
+    Contract: `policies` names those that may be chosen now, `select` gives propensities of these and no others, and what was learned of the policies
+    that stay is kept. A policy that comes back is at the end of `policies`; whether the selector remembers it is its own affair.
+    """
+
+    policies: tuple[str, ...]
+
+    def add_policy(self, name: str) -> None:
+        """Make one more policy available, as the last of `policies`."""
+        ...
+
+    def retire_policy(self, name: str) -> None:
+        """Take a policy out: from now on its probability is exactly 0."""
+        ...
+
+
 SelectorFactory = Callable[[Sequence[str], int, int], Selector]
 """Makes a selector of the policies' names, the length of a context and a seed: a class, or a function."""
 
 
-def factory_name(factory: SelectorFactory) -> str:
-    """What a selector that is none of the registry's is called: by its `name`, else by its class or function."""
+def factory_name(factory: Callable[..., Any]) -> str:
+    """What a selector, or a monitor, that is none of the registry's is called: by its `name`, else by its class or function."""
     return str(getattr(factory, "name", None) or getattr(factory, "__name__", type(factory).__name__))

@@ -17,8 +17,9 @@ from osel_sim.analysis.oracles import oracles
 from osel_sim.analysis.units import units_of
 from osel_sim.context.appended import TASK_NAME
 from osel_sim.core.errors import DataError, UsageError
-from osel_sim.formats.replay_result import PENDING, REPLAY, Choices, read_replay
+from osel_sim.formats.replay_result import CHANGES, PENDING, REPLAY, Choices, read_replay
 from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.reporting.changing_page import changing_page, reward_figure
 from osel_sim.reporting.charts import Figure, Look
 from osel_sim.reporting.cluster_sections import Replayed
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
@@ -65,6 +66,8 @@ def replay_page(folder: Path, options: ReplayOptions) -> Page:
         DataError: no replay there, or its log is missing or is another one.
     """
     with _promised_form(folder):
+        if (changing := _changing(folder, options.log)) is not None:
+            return changing_page(folder, *changing)
         return _page(_read(folder, options.log), options.scenes)
 
 
@@ -75,8 +78,22 @@ def replay_curve(folder: Path) -> Figure:
         DataError: no replay there, or its log is missing or is another one.
     """
     with _promised_form(folder):
+        if (changing := _changing(folder, None)) is not None:
+            return reward_figure(changing[0])
         replay = _read(folder, None)
         return curve_figure(replay.streams, replay.look)
+
+
+def _changing(folder: Path, log_folder: Path | None) -> tuple[Mapping[str, Any], LoggedOutcomes, RewardWeights] | None:
+    """The result of a replay whose streams change, its log and the weights of the reward; None of any other."""
+    result, choices = read_replay(folder)
+    if CHANGES not in result:
+        return None
+    return result, _log(folder, result, choices, log_folder), _weights(result)
+
+
+def _weights(result: Mapping[str, Any]) -> RewardWeights:
+    return RewardWeights(**{key: value for key, value in result["reward"].items() if key != "preset"})
 
 
 @dataclass(frozen=True)
@@ -117,7 +134,7 @@ def _promised_form(folder: Path) -> Iterator[None]:
 def _read(folder: Path, log_folder: Path | None) -> _Replay:
     result, choices = read_replay(folder)
     log = _log(folder, result, choices, log_folder)
-    weights = RewardWeights(**{key: value for key, value in result["reward"].items() if key != "preset"})
+    weights = _weights(result)
     names = _names(result)
     streams = _streams(log, weights, choices, names)
     always = {shown: name.removeprefix("fixed:") for name, shown in names.items() if name.startswith("fixed:")}

@@ -19,6 +19,7 @@ from osel_sim.analysis.verdict_words import in_units
 from osel_sim.core.errors import DataError
 from osel_sim.formats.journal import Decision
 from osel_sim.formats.run_config import read_run
+from osel_sim.reporting.changes_section import changes_table
 from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, thinned
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, note_of
@@ -62,7 +63,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
             regret_figure(streams, [HINDSIGHT], look),
             penalty_figure(streams, run.weights, look, np.arange(len(run.chosen))[None], units_of(run.log)),
         ]
-    blocks += [_propensities(run), _chosen_table(run, selector)]
+    blocks += [_propensities(run), _chosen_table(run, selector), *([changes_table(run.live, run.weights)] if run.live.changes else [])]
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
     sections = [Section("curves", "Learning", blocks)]

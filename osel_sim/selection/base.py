@@ -2,10 +2,11 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from osel_sim.core.errors import DataError, UnknownNameError, UsageError
 from osel_sim.interface.selector import Choice, Context, State
@@ -13,6 +14,9 @@ from osel_sim.interface.selector import Choice, Context, State
 
 class SelectorBase(ABC):
     """Checks that all selectors share. One overrides `_select`, `_update`, `_state`, `_load` and, where it keeps numbers by policy, `_add_policy`.
+
+    Policies may come and go. Numbers by policy are kept for all that ever were, `known`, in an order that only grows; `columns` says which of them
+    may be chosen now. So a policy that comes back is remembered.
 
     Args:
         policies: names to choose from, each once.
@@ -27,8 +31,13 @@ class SelectorBase(ABC):
     off_policy: ClassVar[bool] = False
     """Whether it may learn from outcomes of choices that it did not make itself, such as those of a log."""
 
+    retires: ClassVar[bool] = False
+    """Whether it heeds `columns`, so that policies may retire."""
+
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int) -> None:
         self.policies = tuple(policies)
+        self.known = self.policies
+        self.columns: NDArray[np.int64] = np.arange(len(self.policies))
         if not self.policies or len(set(self.policies)) < len(self.policies):
             raise UsageError(f"a selector needs at least one policy, each named once, got {list(self.policies)}")
         if context_dim < 1:
@@ -63,8 +72,8 @@ class SelectorBase(ABC):
             UnknownNameError: the choice is of a policy this selector does not have.
         """
         self._check_context(context)
-        if choice.policy not in self.policies:
-            raise UnknownNameError("policy", choice.policy, self.policies, "the policies of this selector")
+        if choice.policy not in self.known:  # one that retired meanwhile may still come to an end
+            raise UnknownNameError("policy", choice.policy, self.known, "the policies of this selector")
         if not math.isfinite(reward):
             raise UsageError(f"a reward must be finite, got {reward}; an episode that ended in error has none")
         self._update(context, choice, float(reward))
@@ -79,7 +88,7 @@ class SelectorBase(ABC):
         Raises:
             DataError: it belongs to another kind of selector, other policies or settings, or lacks something.
         """
-        for key, mine in self._header().items():
+        for key, mine in {"known": None, **self._header()}.items():
             if state.get(key) != mine:
                 raise DataError(f"selector state: {key} is {state.get(key)!r}, but this selector has {mine!r}")
         try:
@@ -88,7 +97,7 @@ class SelectorBase(ABC):
             raise DataError(f"selector state is incomplete or damaged ({type(error).__name__}: {error})") from None
 
     def add_policy(self, name: str) -> None:
-        """Make one more policy available, as the last of `policies`.
+        """Make one more policy available, as the last of `policies`. One that was there before is remembered.
 
         Raises:
             UsageError: it is there already.
@@ -96,10 +105,40 @@ class SelectorBase(ABC):
         if name in self.policies:
             raise UsageError(f"policy {name!r} is already among {', '.join(self.policies)}")
         self._add_policy(name)
-        self.policies = (*self.policies, name)
+        if name not in self.known:
+            self.known = (*self.known, name)
+        self._set_policies((*self.policies, name))
+
+    def retire_policy(self, name: str) -> None:
+        """Take a policy out: from now on it is not chosen, and propensities do not name it. What was learned is kept.
+
+        Raises:
+            UnknownNameError: it is not there.
+            UsageError: it is the last one, or this selector cannot do without a policy that it had.
+        """
+        if not self.retires:
+            raise UsageError(f"selector {self.name!r} cannot retire policies: its class says `retires = True` once it chooses among `columns` only")
+        if name not in self.policies:
+            raise UnknownNameError("policy", name, self.policies, "the policies of this selector")
+        if len(self.policies) == 1:
+            raise UsageError(f"policy {name!r} is the last one: add another before it retires")
+        self._retire_policy(name)
+        self._set_policies(tuple(policy for policy in self.policies if policy != name))
+
+    def tell(self, told: Mapping[str, Any]) -> None:
+        """Hear what policies declare, from now on: settings as the constructor takes them. Most selectors want to know nothing.
+
+        Called before `add_policy`, of all policies, the new one included.
+        """
+        return None
 
     def _header(self) -> State:
-        return {"selector": self.name, "policies": list(self.policies), "context_dim": self.context_dim, "settings": self.settings}
+        changed = {} if self.known == self.policies else {"known": list(self.known)}
+        return {"selector": self.name, "policies": list(self.policies), "context_dim": self.context_dim, "settings": self.settings, **changed}
+
+    def _set_policies(self, policies: tuple[str, ...]) -> None:
+        self.policies = policies
+        self.columns = np.array([self.known.index(policy) for policy in policies], np.int64)
 
     def _check_context(self, context: Context) -> None:
         if not isinstance(context, np.ndarray) or context.shape != (self.context_dim,) or context.dtype != np.float32:
@@ -121,5 +160,9 @@ class SelectorBase(ABC):
     def _load(self, state: State) -> None: ...
 
     def _add_policy(self, name: str) -> None:
-        """Called before the name joins `policies`."""
+        """Called before the name joins `policies`; it may be among `known`."""
+        return None
+
+    def _retire_policy(self, name: str) -> None:
+        """Called before the name leaves `policies`."""
         return None

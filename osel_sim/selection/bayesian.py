@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from osel_sim.core.errors import UnknownNameError, UsageError
-from osel_sim.core.files import content_digest
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
-from osel_sim.selection.features import Array, Features, Part, Sketch
+from osel_sim.selection.features import Array, Features, Part, Sketch, warm_table
 from osel_sim.selection.regression import NOISE_WEIGHT, Moments, SharedRegression, fit
-from osel_sim.selection.skills import DECLARED, NOT_DECLARED, Skills
+from osel_sim.selection.skills import DECLARED, NOT_DECLARED, UNKNOWN, Skills
 from osel_sim.statistics.best import probability_of_best
 
 MEAN = 1.0
@@ -36,9 +35,6 @@ GROWTH = 1.25
 
 PIECES = 16
 """A change is looked for at the ends of so many equal pieces of what was seen."""
-
-WARM = 2000
-"""Of more warm contexts than these, evenly spaced ones are taken."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +128,7 @@ class BayesianSelector(SelectorBase):
     """
 
     off_policy: ClassVar[bool] = True
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, features: Features, prior: Prior) -> None:
         super().__init__(policies, context_dim, seed)
@@ -145,7 +142,7 @@ class BayesianSelector(SelectorBase):
         self._costs_declared = None if costs is None else {name: float(cost) for name, cost in costs.items()}
         self._costs = np.array([self._cost(name) for name in self.policies])
         self._sketch, self._first = Sketch(context_dim, parts), parts[0]
-        self._warm, self._warm_digest = self._check_warm(prior.warm_contexts)
+        self._warm, self._warm_digest = warm_table(prior.warm_contexts, context_dim, self._sketch)
         end = self._sketch.parts[0]
         seen = (slice(None, end), slice(None), slice(end, None)) if prior.parts else ()
         self._views: list[Features] = [Part(deepcopy(features), columns) for columns in seen] or [features]
@@ -183,7 +180,7 @@ class BayesianSelector(SelectorBase):
     def _select(self, context: Context) -> Choice:
         self._catch_up()
         prior, rows = self._prior, self._rows(context)
-        means, variances = self._regression.predict(rows)
+        means, variances = self._regression.predict(rows, self.columns)
         of_mean = np.minimum(variances, 1.0 / (self._counts + 1.0 / MEAN))
         of_context = variances - of_mean
         unit = self._deviation * math.sqrt(self._regression.noise)
@@ -191,7 +188,7 @@ class BayesianSelector(SelectorBase):
         scores = self._deviation * (means + rows[:, : len(self._guess)] @ self._guess) - self._costs + hope
         few = 1.0 + FEW * self._counts / (self._counts + 1.0) ** 2
         chance = prior.mean_chance**2 * few * of_mean + prior.chance**2 * of_context
-        propensities = probability_of_best(scores, unit * np.sqrt(chance))
+        propensities = probability_of_best(scores[self.columns], (unit * np.sqrt(chance))[self.columns])
         random = min(0.5, prior.floor / math.sqrt(len(self._chosen) + 1))
         propensities = (1.0 - random) * propensities + random / len(propensities)
         index = int(self._generator.choice(len(self.policies), p=propensities))
@@ -199,7 +196,7 @@ class BayesianSelector(SelectorBase):
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         sketched, heads = self._see(context)
-        index = self.policies.index(choice.policy)
+        index = self.known.index(choice.policy)
         self._contexts.append(sketched)
         self._heads.append(heads[index].copy())
         self._chosen.append(index)
@@ -236,7 +233,7 @@ class BayesianSelector(SelectorBase):
         if change := self._change(contexts, chosen, targets):
             for seen in (self._contexts, self._heads, self._chosen, self._targets):
                 del seen[:change]
-            self._counts = np.bincount(self._chosen, minlength=len(self.policies))
+            self._counts = np.bincount(self._chosen, minlength=len(self._costs))
             self._next_fit = max(count - change + 1, math.ceil((count - change) * GROWTH))
             self._fit(count - change)
             return
@@ -319,7 +316,7 @@ class BayesianSelector(SelectorBase):
     def _see(self, context: Context) -> tuple[NDArray[np.float32], Array]:
         """A context's sketch, and the constants of its rows. `update` mostly asks for what `select` asked for before."""
         if self._seen is None or not np.array_equal(self._seen[0], context):
-            share = np.ones((len(self._costs), 1)) if self._skills is None else self._skills.share(context[: self._first], self.policies)[:, None]
+            share = np.ones((len(self._costs), 1)) if self._skills is None else self._skills.share(context[: self._first], self.known)[:, None]
             heads = share if self._skills is None else np.concatenate([share, 1.0 - share], axis=1)
             self._seen = context.copy(), np.array(self._sketch(context)), heads
         return self._seen[1:]
@@ -339,16 +336,22 @@ class BayesianSelector(SelectorBase):
             raise UsageError(f"the expected cost of {policy!r} must be finite, got {self._costs_declared[policy]}")
         return self._costs_declared[policy]
 
-    def _check_warm(self, contexts: ArrayLike | None) -> tuple[Array, str | None]:
-        if contexts is None:
-            return np.zeros((0, self._sketch.dim)), None
-        table = np.ascontiguousarray(contexts, np.float32)
-        if table.ndim != 2 or table.shape[1] != self.context_dim or not len(table) or not np.isfinite(table).all():
-            raise UsageError(f"warm_contexts must be a finite table (n, {self.context_dim}), got shape {table.shape}")
-        few = table[np.linspace(0, len(table) - 1, min(WARM, len(table))).astype(np.int64)]
-        return self._sketch(few).astype(np.float64), content_digest(table.tobytes())
+    def tell(self, told: Mapping[str, Any]) -> None:
+        """Take over `expected_costs` and `skills`. What was seen keeps what was believed when it was seen."""
+        self._catch_up()
+        costs, skills = told.get("expected_costs") or {}, told.get("skills")
+        if self._costs_declared is not None:
+            self._costs_declared |= {name: float(cost) for name, cost in costs.items()}
+        if skills is not None and skills.dimension != self._first:
+            raise UsageError(f"the examples of skills have length {skills.dimension}, contexts {self._first}")
+        if skills is not None and self._skills is None:  # until now every policy was one that declares nothing
+            self._guess, self._heads = np.array([DECLARED, NOT_DECLARED]), [np.array([UNKNOWN, 1.0 - UNKNOWN]) for _ in self._heads]
+            self._fit(len(self._targets))
+        self._skills, self._seen = skills or self._skills, None
 
     def _add_policy(self, name: str) -> None:
+        if name in self.known:
+            return
         self._catch_up()
         self._costs = np.append(self._costs, self._cost(name))
         self._counts = np.append(self._counts, 0)
@@ -372,7 +375,7 @@ class BayesianSelector(SelectorBase):
     def _load(self, state: State) -> None:
         self._contexts, self._heads = list(state["contexts"].copy()), list(state["heads"].copy())
         self._chosen, self._targets = state["chosen"].tolist(), state["targets"].tolist()
-        self._counts = np.bincount(state["chosen"], minlength=len(self.policies))
+        self._counts = np.bincount(state["chosen"], minlength=len(self._costs))
         self._centre, self._deviation, self._signal, self._next_fit = state["model"]
         self._generator.bit_generator.state = state["random"]
         self._regression = SharedRegression(**{key: copy(value) for key, value in _part(state, "regression.").items()})

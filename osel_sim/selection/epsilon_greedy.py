@@ -26,6 +26,7 @@ class EpsilonGreedySelector(SelectorBase):
     """
 
     name: ClassVar[str] = "epsilon_greedy"
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, *, gap: float = 0.01) -> None:
         super().__init__(policies, context_dim, seed)
@@ -48,7 +49,7 @@ class EpsilonGreedySelector(SelectorBase):
         return min(1.0, len(self.policies) / ((self._decisions + 1) * self.gap))
 
     def _select(self, context: Context) -> Choice:
-        estimates = np.where(self._counts > 0, self._means, np.inf)
+        estimates = np.where(self._counts > 0, self._means, np.inf)[self.columns]
         best = estimates == estimates.max()
         propensities = self.epsilon / len(self.policies) + (1.0 - self.epsilon) * best / best.sum()
         index = self._generator.choice(len(self.policies), p=propensities)
@@ -56,11 +57,13 @@ class EpsilonGreedySelector(SelectorBase):
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
-        index = self.policies.index(choice.policy)
+        index = self.known.index(choice.policy)
         self._counts[index] += 1
         self._means[index] += (reward - self._means[index]) / self._counts[index]
 
     def _add_policy(self, name: str) -> None:
+        if name in self.known:
+            return
         self._counts = np.append(self._counts, 0)
         self._means = np.append(self._means, 0.0)
 

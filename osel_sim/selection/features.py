@@ -5,15 +5,20 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import eigh
 
+from osel_sim.core.errors import UsageError
+from osel_sim.core.files import content_digest
 from osel_sim.interface.selector import State
 
 Array = NDArray[np.float64]
 
 SKETCH = 256
 """Contexts longer than this are projected to this length first, at random but always in the same way: distances survive it, and a fit stays quick."""
+
+WARM = 2000
+"""Of more warm contexts than these, evenly spaced ones are taken."""
 
 NEGLIGIBLE = 1e-6
 """Components with less than this part of the largest variance are rounding, not context."""
@@ -70,6 +75,24 @@ class Sketch:
         parts = [contexts[..., start:end] for start, end in pairwise(self._ends)]
         short = [part if matrix is None else part @ matrix for part, matrix in zip(parts, self._matrices, strict=True)]
         return short[0] if len(short) == 1 else np.concatenate(short, axis=-1)
+
+
+def warm_table(contexts: ArrayLike | None, context_dim: int, sketch: Sketch) -> tuple[Array, str | None]:
+    """Contexts to learn features from before the first decision, sketched, and a digest of all of them; none where there are none.
+
+    Args:
+        contexts: (n, context_dim).
+
+    Raises:
+        UsageError: contexts of another form.
+    """
+    if contexts is None:
+        return np.zeros((0, sketch.dim)), None
+    table = np.ascontiguousarray(contexts, np.float32)
+    if table.ndim != 2 or table.shape[1] != context_dim or not len(table) or not np.isfinite(table).all():
+        raise UsageError(f"warm_contexts must be a finite table (n, {context_dim}), got shape {table.shape}")
+    few = table[np.linspace(0, len(table) - 1, min(WARM, len(table))).astype(np.int64)]
+    return sketch(few).astype(np.float64), content_digest(table.tobytes())
 
 
 def _projection(length: int) -> NDArray[np.float32]:

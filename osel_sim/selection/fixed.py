@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from osel_sim.core.errors import UnknownNameError
+from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
 
@@ -20,6 +20,7 @@ class FixedSelector(SelectorBase):
     """
 
     name: ClassVar[str] = "fixed"
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, *, policy: str) -> None:
         super().__init__(policies, context_dim, seed)
@@ -34,6 +35,11 @@ class FixedSelector(SelectorBase):
 
     def _select(self, context: Context) -> Choice:
         return Choice(self.policy, {name: float(name == self.policy) for name in self.policies})
+
+    def _retire_policy(self, name: str) -> None:
+        if name == self.policy:
+            others = " or ".join(f"fixed:{policy}" for policy in self.policies if policy != name)
+            raise UsageError(f"policy {name!r} is the one that fixed:{name} always chooses: take another selector, such as {others}")
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         return None

@@ -69,16 +69,19 @@ class SharedRegression:
     noise: float
     evidence: float
 
-    def predict(self, rows: Array) -> tuple[Array, Array]:
+    def predict(self, rows: Array, columns: NDArray[np.int64] | None = None) -> tuple[Array, Array]:
         """Means (P,) of what the policies come to, and variances (P,), given each one's row (P, K).
 
         What policies have in common does not tell them apart. So a variance is that of a policy's own part, and of how far its shared part differs
         from the shared part of the policy of the highest mean: between that one and any other, variances add up to that of their difference.
+
+        Args:
+            columns: policies that may be chosen, among which the highest mean is looked for; None: all.
         """
         gains = (self.covariances @ rows[:, :, None])[:, :, 0]
         pulls = gains / self.prior  # how much of the shared weights is left in a policy's mean once its own have followed
         means = (rows * self.means).sum(axis=1) + pulls @ (self.shared_covariance @ self.information)
-        apart = pulls - pulls[means.argmax()]
+        apart = pulls - pulls[means.argmax() if columns is None else columns[means[columns].argmax()]]
         variances = (gains * rows).sum(axis=1) + ((apart @ self.shared_covariance) * apart).sum(axis=1)
         return means, np.maximum(variances, 1e-12)
 

@@ -84,6 +84,19 @@ def reward(outcome: Outcome, weights: RewardWeights) -> float:
     return float(combined(weights, credited(outcome, weights.success), time, outcome.price))
 
 
+def to_go(reward: float, seconds: Sequence[float], steps: Sequence[int], prices: Sequence[float], weights: RewardWeights) -> tuple[float, ...]:
+    """Reward-to-go from moments of an episode: its reward without what time and price up to there took off it. Their differences sum to the reward.
+
+    Args:
+        reward: of the whole episode.
+        seconds, steps, prices: until each moment, as `total_seconds`, control steps and cents.
+    """
+    return tuple(
+        reward + float(charge(weights, counted_time(weights, step, second), price))
+        for second, step, price in zip(seconds, steps, prices, strict=True)
+    )
+
+
 def check_reward(value: float | None, outcome: Outcome, weights: RewardWeights, place: str) -> None:
     """Refuse a reward that was written down, and is not what its outcome comes to.
 

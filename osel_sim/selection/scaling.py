@@ -20,7 +20,12 @@ class RunningComponents:
     Args:
         context_dim: length of a context.
         components: how many numbers to make of it; those that the contexts do not fill are 0.
+
+    Attributes:
+        fits: how often they were fitted; what was transformed before the last time looks different now.
     """
+
+    fits = 0
 
     def __init__(self, context_dim: int, components: int) -> None:
         self.dim = components
@@ -73,6 +78,7 @@ class RunningComponents:
             left, _, right = np.linalg.svd((fitted.transform(seen) @ wide).T @ before)
             wide = wide @ (left @ right)
         self._fitted, self._turn = fitted, np.ascontiguousarray(wide)
+        self.fits += 1
 
     def _features(self, sketched: NDArray[np.float64]) -> NDArray[np.float64]:
         if not len(self._turn):

@@ -24,6 +24,7 @@ class ThompsonSelector(SelectorBase):
 
     name: ClassVar[str] = "thompson"
     off_policy: ClassVar[bool] = True
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int) -> None:
         super().__init__(policies, context_dim, seed)
@@ -37,18 +38,21 @@ class ThompsonSelector(SelectorBase):
         overall = float((self._counts * self._means).sum() / total) if total else 0.0
         noise = (1.0 + self._squares) / (1.0 + total)
         weight = self._counts + 1.0
-        propensities = probability_of_best((self._counts * self._means + overall) / weight, np.sqrt(noise / weight))
+        means = (self._counts * self._means + overall) / weight
+        propensities = probability_of_best(means[self.columns], np.sqrt(noise / weight)[self.columns])
         index = self._generator.choice(len(self.policies), p=propensities)
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
-        index = self.policies.index(choice.policy)
+        index = self.known.index(choice.policy)
         self._counts[index] += 1
         before = reward - self._means[index]
         self._means[index] += before / self._counts[index]
         self._squares += before * (reward - self._means[index])
 
     def _add_policy(self, name: str) -> None:
+        if name in self.known:
+            return
         self._counts = np.append(self._counts, 0)
         self._means = np.append(self._means, 0.0)
 

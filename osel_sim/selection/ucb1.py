@@ -25,6 +25,7 @@ class UCB1Selector(SelectorBase):
 
     name: ClassVar[str] = "ucb1"
     off_policy: ClassVar[bool] = True
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, *, width: float = 1.0) -> None:
         super().__init__(policies, context_dim, seed)
@@ -43,18 +44,20 @@ class UCB1Selector(SelectorBase):
     def _select(self, context: Context) -> Choice:
         tried = self._counts > 0
         bonus = self.width * np.sqrt(2.0 * np.log(max(1, int(self._counts.sum()))) / np.maximum(1, self._counts))
-        index = np.where(tried, self._means + bonus, np.inf)
+        index = np.where(tried, self._means + bonus, np.inf)[self.columns]
         best = index == index.max()
         propensities = best / best.sum()
         chosen = self._generator.choice(len(self.policies), p=propensities)
         return Choice(self.policies[chosen], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
-        index = self.policies.index(choice.policy)
+        index = self.known.index(choice.policy)
         self._counts[index] += 1
         self._means[index] += (reward - self._means[index]) / self._counts[index]
 
     def _add_policy(self, name: str) -> None:
+        if name in self.known:
+            return
         self._counts = np.append(self._counts, 0)
         self._means = np.append(self._means, 0.0)
 

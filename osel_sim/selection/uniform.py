@@ -13,6 +13,7 @@ class UniformSelector(SelectorBase):
     """Chooses uniformly at random and learns nothing. See `SelectorBase` for the arguments."""
 
     name: ClassVar[str] = "random"
+    retires: ClassVar[bool] = True
 
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int) -> None:
         super().__init__(policies, context_dim, seed)

@@ -33,6 +33,8 @@ class VowpalSelector(SelectorBase):
         UsageError: the package is not installed, or a number out of range.
     """
 
+    retires: ClassVar[bool] = True
+
     def __init__(self, policies: Sequence[str], context_dim: int, seed: int, learning_rate: float, exploration: str) -> None:
         super().__init__(policies, context_dim, seed)
         if not learning_rate > 0.0:
@@ -57,13 +59,15 @@ class VowpalSelector(SelectorBase):
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         label = f"0:{-reward!r}:{choice.propensities[choice.policy]!r} "
-        self._workspace.learn(self._example(context, self.policies.index(choice.policy), label))
+        self._workspace.learn(self._example(context, self.known.index(choice.policy), label))
 
     def _example(self, context: Context, chosen: int = -1, label: str = "") -> list[str]:
         """The context and one line a policy in Vowpal Wabbit's text format; the chosen one carries cost and probability."""
         features = " ".join(f"{index}:{value:.6g}" for index, value in enumerate(self._scale.transform(context).tolist()) if value)
         # Policies are numbered: a name may contain what has a meaning in this format.
-        return [f"shared |c {features} one:1", *(f"{label if index == chosen else ''}|a p{index}" for index in range(len(self.policies)))]
+        columns = self.columns.tolist()
+        lines = columns if chosen < 0 or chosen in columns else [*columns, chosen]
+        return [f"shared |c {features} one:1", *(f"{label if index == chosen else ''}|a p{index}" for index in lines)]
 
     def _state(self) -> State:
         with tempfile.TemporaryDirectory() as folder:

@@ -7,6 +7,7 @@ where a draw falls within that rounding of the border between two policies, and 
 """
 
 import functools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,6 +72,22 @@ class FastPPO:
         self.actor = _tower(state, "policy_net", "action_net")
         self.critic = _tower(state, "value_net", "value_net")
         self.steps = np.zeros(1, np.int64)
+
+    def change_outputs(self, rows: NDArray[np.float32]) -> None:
+        """Make each row of the output layer, and of Adam's moments of it, a weighted sum of the rows that there are, as `PPOSelector.add_policy` and
+        `retire_policy` do.
+
+        Args:
+            rows: (policies then, policies now), the weights.
+        """
+        *parts, sizes = self.actor
+        inputs, outputs = int(sizes[-2]), int(sizes[-1])
+        kept = len(parts[0]) - outputs * (inputs + 1)
+        made = []
+        for part in parts:
+            weight, bias = part[kept : kept + outputs * inputs].reshape(outputs, inputs), part[-outputs:]
+            made.append(np.concatenate([part[:kept], (rows @ weight).ravel(), rows @ bias]))
+        self.actor = (*_side_by_side(made), np.array([*sizes[:-1], len(rows)], np.int64))
 
     def run(self, contexts: NDArray[np.float32], rewards: NDArray[np.float64]) -> NDArray[np.int16]:
         """Go through a stream.
@@ -152,10 +169,15 @@ def _tower(state: dict[str, NDArray[np.float32]], hidden: str, output: str) -> T
     matrices = [state[f"{name}.weight"] for name in names]
     flat = np.concatenate([part.ravel() for name in names for part in (state[f"{name}.weight"], state[f"{name}.bias"])]).astype(np.float32)
     sizes = np.array([matrices[0].shape[1], *(len(matrix) for matrix in matrices)], np.int64)
-    # Together, because numpy asks for large pages where an array has 4 MB or more.
-    weights, first, second = (row[: len(flat)] for row in _aligned((3, -(-len(flat) // LINE) * LINE)))
-    weights[:] = flat
-    return weights, first, second, sizes
+    nothing = np.zeros_like(flat)
+    return (*_side_by_side([flat, nothing, nothing]), sizes)
+
+
+def _side_by_side(parts: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Three arrays of one length, together, because numpy asks for large pages where an array has 4 MB or more."""
+    weights, first, second = (row[: len(parts[0])] for row in _aligned((3, -(-len(parts[0]) // LINE) * LINE)))
+    weights[:], first[:], second[:] = parts
+    return weights, first, second
 
 
 def _aligned(shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -1,6 +1,6 @@
 """stable-baselines3's PPO with the paper's settings, driven decision by decision."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, get_args
 
 import numpy as np
@@ -55,6 +55,7 @@ class PPOSelector(SelectorBase):
     """
 
     name: ClassVar[str] = "ppo"
+    retires: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -178,8 +179,8 @@ class PPOSelector(SelectorBase):
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         import torch
 
-        if len(choice.propensities) != len(self.policies):
-            return  # chosen before the last add_policy: see _add_policy
+        if choice.propensities.keys() != set(self.policies):
+            return  # chosen before policies came or went: see _add_policy
         if not {"value", "log_probability"} <= choice.details.keys():
             raise UsageError("PPO learns from its own choices only: pass the Choice that select() returned")
         rollout = self._algorithm.rollout_buffer
@@ -232,13 +233,22 @@ class PPOSelector(SelectorBase):
 
         The new policy's logit is then the mean of the old ones': it is tried now and then where the choice was clear, often where it was open, and
         the odds among the old policies do not change. Decisions not yet trained on are dropped, because their probabilities are of the old layer:
-        up to n_steps - 1, and those in flight.
+        up to n_steps - 1, and those in flight. A policy that comes back is a new one: its row would be of features that have moved on since.
         """
+        self._rebuild((*self.policies, name), lambda rows: np.concatenate([rows, rows.mean(axis=0, keepdims=True)]))
+
+    def _retire_policy(self, name: str) -> None:
+        """Take its row out of the output layer: the odds among the others do not change. Decisions not yet trained on are dropped."""
+        index = self.policies.index(name)
+        self._rebuild(tuple(policy for policy in self.policies if policy != name), lambda rows: np.delete(rows, index, axis=0))
+
+    def _rebuild(self, policies: tuple[str, ...], change: Callable[[NDArray[Any]], NDArray[Any]]) -> None:
+        """Build the network for other policies, with `change` made to the rows of the output layer and of Adam's moments of it."""
         state = self._state()
         outputs = [index for index, (key, _) in enumerate(self._algorithm.policy.named_parameters()) if key.startswith("action_net.")]
         for key, value in state.items():
             if key.startswith(("network.action_net.", *(f"optimizer.{index}.exp_avg" for index in outputs))):
-                state[key] = np.concatenate([value, value.mean(axis=0, keepdims=True)])
+                state[key] = change(value)
         state["rollout_size"] = 0
-        self._algorithm = self._build((*self.policies, name))
+        self._algorithm = self._build(policies)
         self._load(state)

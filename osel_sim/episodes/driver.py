@@ -1,0 +1,45 @@
+"""A policy at the wheel: what fixes its chance, and what it has used up."""
+
+import hashlib
+from dataclasses import dataclass
+
+from osel_sim.formats.policy_file import PolicySpec
+from osel_sim.interface.call import Caller
+
+
+@dataclass(frozen=True)
+class Driver:
+    """A policy ready to drive: its file and whom to ask."""
+
+    spec: PolicySpec
+    caller: Caller
+
+
+@dataclass
+class Tally:
+    """What one driver has used up since it took over.
+
+    Attributes:
+        began: control steps of the episode when it took over.
+    """
+
+    spec: PolicySpec
+    began: int = 0
+    calls: int = 0
+    actions: int = 0
+    megabytes: float = 0.0
+
+    @property
+    def price(self) -> float:
+        """Cents."""
+        return self.spec.price.of(self.actions, self.calls, self.megabytes)
+
+
+def episode_seed(instance_key: str, policy: str, repeat: int) -> tuple[int, ...]:
+    """What fixes an episode's chance (network delays, noise on actions): the instance, the policy and the repeat, never the order of episodes."""
+    return (*(int.from_bytes(hashlib.sha256(text.encode()).digest()[:4], "big") for text in (instance_key, policy)), repeat)
+
+
+def monitor_seed(instance: str, policy: str, repeat: int = 0) -> tuple[int, ...]:
+    """What fixes a monitor's chance in an episode: the instance, the policy that drives first, and the repeat."""
+    return (*episode_seed(instance, policy, repeat), 2)

@@ -1,0 +1,1 @@
+"""Monitors: who drives on at a decision point of an episode."""

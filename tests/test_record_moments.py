@@ -1,0 +1,129 @@
+"""`python -m osel_sim.record --moments K` with real workers and servers: every way on, the same bytes however it went."""
+
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from run_helpers import command, environment, execute, make_world, wait_for_lines
+
+from osel_sim.episodes.moment_recording import MOMENT_SHARDS
+from osel_sim.formats.moments import MOMENTS, SEEN, SIGNALS, read_moments
+from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.record import main as record_main
+
+SIZE = ("--instances", 2, "--action-noise", 0.05, "--moments", 1, "--most-moments", 2)
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        folder = make_world(tmp_path_factory.mktemp("world"))
+        patch.syspath_prepend(str(folder / "plugin"))
+        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])  # of servers that are started from here
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def reference(world):
+    """A recording that nobody disturbed."""
+    folder = world / "reference"
+    done = execute(world, "record", *SIZE, "--workers", 1, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {name: (folder / name).read_bytes() for name in (MOMENTS, SEEN, "rollouts.parquet", "contexts.npz")}
+
+
+def resume(world: Path, folder: Path, *flags: object) -> int:
+    places = ["--tasks", world / "tasks", "--policies-dir", world / "policies"]
+    return record_main(list(map(str, ["--resume", *places, "--out", folder, *flags])))
+
+
+def test_every_other_policy_goes_on_from_every_moment(reference):
+    table, (episodes, _) = read_moments(reference), read_rollouts(reference)
+    assert sorted(file.name for file in reference.iterdir()) == ["contexts.npz", SEEN, MOMENTS, "rollouts.parquet", "run.json"]
+    found = [(row.instance, row.first, row.call, row.second) for row in table.rows]
+    assert found == [
+        (row.instance, row.policy, call, second)
+        for row in episodes
+        for call in (1, 2)
+        for second in (None, "wild" if row.policy == "calm" else "calm")
+    ]
+    outcomes = {(row.instance, row.policy): row.outcome for row in episodes}
+    assert all(row.outcome == outcomes[row.instance, row.first] for row in table.rows if row.second is None)
+    assert all(row.outcome != outcomes[row.instance, row.first] for row in table.rows if row.second is not None)
+    moments = len(table.rows) // 2
+    assert table.seen.pictures.shape == (moments, 53) and len(np.unique(table.seen.pictures, axis=0)) == moments
+    change = table.seen.signals[:, SIGNALS.index("change")].reshape(-1, 2)
+    assert np.isnan(change[:, 0]).all() and (change[:, 1] > 0).all(), "nothing was looked at before the first"
+
+
+def test_duty_and_price_are_of_who_drove(reference):
+    for row in read_moments(reference).rows:
+        remote = row.first if row.second is None else row.second
+        if remote == "calm" and row.first == "calm":
+            assert row.remote_steps == 0 and row.price == row.price_first == 0
+        elif row.first == "wild":
+            assert row.remote_steps == (row.step if row.second else row.steps) and row.price == row.price_first > 0
+        else:
+            assert row.remote_steps == row.steps - row.step and row.price > row.price_first == 0
+
+
+def test_the_episodes_are_those_of_a_recording_without_moments(world, reference):
+    folder = world / "plain"
+    assert record_main(list(map(str, command(world, "record", "--instances", 2, "--action-noise", 0.05, "--workers", 1, "--out", folder)[3:]))) == 0
+    assert read_rollouts(folder)[0] == read_rollouts(reference)[0]
+
+
+def test_killed_and_resumed_with_more_workers_it_writes_the_same_bytes(world, reference):
+    folder = world / "half"
+    arguments = command(world, "record", *SIZE, "--workers", 1, "--out", folder)
+    process = subprocess.Popen(arguments, env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    wait_for_lines(process, folder / MOMENT_SHARDS, 2)  # an instance: two episodes
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (folder / MOMENTS).exists()
+    assert resume(world, folder, "--workers", 2) == 0
+    assert files(folder) == files(reference)
+
+
+def test_repeats_are_added_with_their_moments_and_what_would_lack_them_is_refused(world, reference, capsys):
+    folder = world / "more"
+    shutil.copytree(reference, folder)
+    for flags, says in (
+        (["--moments", 2], "began with 1"),
+        (["--policies", "other"], "would lack"),
+        (["--encoder", "osel_small"], "pictures of colours"),
+    ):
+        assert resume(world, folder, *flags) == 2
+        assert says in capsys.readouterr().err
+    assert resume(world, folder, "--repeats", 2, "--repeat-every", 2) == 0
+    before, after = read_moments(reference).rows, read_moments(folder).rows
+    assert [row for row in after if row.repeat == 0] == before
+    assert {row.repeat for row in after} == {0, 1}
+
+
+@pytest.mark.parametrize(
+    ("flags", "complaint"),
+    [
+        (["--most-moments", 2], "is for a recording with moments"),
+        (["--moments", 2, "--until-decided"], "does not go with --until-decided"),
+        (["--moments", 0], "--moments"),
+        (["--moments", 2, "--policies", "calm"], "has nobody to hand over to"),
+    ],
+)
+def test_wrong_settings_get_one_line(world, capsys, flags, complaint):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(world)
+        try:
+            code = record_main(list(map(str, command(world, "record", *flags, "--out", world / "wrong")[3:])))
+        except SystemExit as end:
+            code = end.code
+    assert code == 2
+    assert complaint in capsys.readouterr().err
+    assert not (world / "wrong").exists()
