@@ -323,7 +323,7 @@ class _Run:
 
     def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
         """What watches the run."""
-        from osel_sim.episodes.budget_file import BudgetFile
+        from osel_sim.episodes.budget_file import BudgetFile, Graded
         from osel_sim.episodes.progress import Progress
         from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
         from osel_sim.episodes.tensorboard import TensorBoard
@@ -334,7 +334,7 @@ class _Run:
         films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
         if self.spending is not None:
-            graded = "subgoals" if self.weights.success == "subgoals" else "success"
+            graded: Graded = "subgoals" if self.weights.success == "subgoals" else "success"
             self.spent = BudgetFile(self.spending, graded, config.episodes)
         spent = [self.spent] if self.spent is not None else []
         return [TimingFile(), WarningFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
