@@ -71,9 +71,7 @@ def replay(
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
     if has_moments(config.log):
-        if config.robots > 1:
-            raise SettingError("robots", f"{config.log} is a table of moments, of which monitors learn; leave the flag out")
-        return replay_moments(config)
+        return replay_moments(config, factories, functions)
     if config.monitors:
         raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
     return _Replay(config, factories, functions, on_result).execute()
