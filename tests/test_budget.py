@@ -14,6 +14,7 @@ from osel_sim.episodes.most_costs import most_costs
 from osel_sim.formats import library
 from osel_sim.formats.budget import read_budget
 from osel_sim.formats.journal import read_journal
+from osel_sim.formats.merged_policy import merged
 from osel_sim.reporting.budget_section import run_budget
 from osel_sim.run import main as run_main
 from osel_sim.selection.budget import Budget, Budgeted, dual_price
@@ -135,6 +136,8 @@ def test_no_episode_costs_more_than_its_policy_s_file_allows(world):
     most = most_costs(specs, specs, HORIZON, task.specification)
     assert most["calm"] == 0.0
     assert 0.02 * HORIZON + 4 * 0.1 < most["wild"] < 0.02 * HORIZON + 4 * 0.3  # and what the messages weigh
+    both = merged("merge:calm+wild", lambda name: library.load_policy(name, world / "policies"))
+    assert most_costs([both], [both, *specs], HORIZON, task.specification)["merge:calm+wild"] == most["wild"]  # whose own price is nothing
 
 
 def test_a_live_run_keeps_to_its_budget_and_resumes_to_the_same_bytes(world, capsys):

@@ -128,7 +128,7 @@ class _Run:
         self._check_selector()
         self.budget = budget_of(config, self.tasks, [*self.policies, *self.plan.joined.values()])
         self.sharing = check_robots(config, self.tasks, named=self.factory is None)
-        check_monitor(config, monitor, self.policies)
+        check_monitor(config, monitor, self.policies, changing=bool(self.plan.changes))
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
@@ -335,8 +335,7 @@ class _Run:
         films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
         if self.spending is not None:
-            graded = "subgoals" if self.weights.success == "subgoals" else "success"
-            self.spent = BudgetFile(self.spending, graded, config.episodes)
+            self.spent = BudgetFile(self.spending, "subgoals" if self.weights.success == "subgoals" else "success", config.episodes)
         spent = [self.spent] if self.spent is not None else []
         return [TimingFile(), WarningFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
 

@@ -25,14 +25,15 @@ def most_costs(policies: Sequence[PolicySpec], everyone: Sequence[PolicySpec], h
 
 
 def _alone(spec: PolicySpec, horizon: int, environment: EnvironmentSpec) -> float:
+    """Of a merge all parts are asked and paid, at every call of it."""
     calls = math.ceil(horizon / spec.execute)
-    return sum(_asked(part, calls, horizon, environment) for part in parts_of(spec))  # of a merge all are asked, and all are paid
+    return sum(part.price.of(horizon, calls, calls * _megabytes(part, horizon, environment)) for part in parts_of(spec))
 
 
-def _asked(spec: PolicySpec, calls: int, horizon: int, environment: EnvironmentSpec) -> float:
+def _megabytes(spec: PolicySpec, horizon: int, environment: EnvironmentSpec) -> float:
+    """What a call moves, at most."""
     images = len(spec.cameras) * 3 * spec.image_size**2 * spec.history
-    megabytes = 1e-6 * (images + 8 * environment.action.dimension * max(spec.execute, horizon) + OVERHEAD) if spec.is_remote else 0.0
-    return spec.price.of(horizon, calls, calls * megabytes)
+    return 1e-6 * (images + 8 * environment.action.dimension * max(spec.execute, horizon) + OVERHEAD) if spec.is_remote else 0.0
 
 
 def _fallback(spec: PolicySpec, named: Mapping[str, PolicySpec], horizon: int, environment: EnvironmentSpec) -> float:
