@@ -15,10 +15,12 @@ from threadpoolctl import threadpool_limits
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.streams import Streams, draw_streams
 from osel_sim.analysis.warm_start import WarmStart, show
+from osel_sim.analysis.within_budget import Within
 from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.formats.replay_result import Choices
 from osel_sim.interface.selector import SelectorFactory
+from osel_sim.selection.budget import Budget
 from osel_sim.selection.reward import RewardWeights
 
 WARM = ":warm"
@@ -36,11 +38,13 @@ class Setup:
         weights: of the reward.
         settings: selector -> keyword arguments, where they are not to be the defaults.
         warm_start: of other instances than the log's; needed for selectors named `NAME:warm`.
+        budget: that all selectors keep to; None: they may spend what they like.
     """
 
     weights: RewardWeights
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     warm_start: WarmStart | None = None
+    budget: Budget | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +72,8 @@ class Part:
 
 @dataclass(frozen=True)
 class _Material:
-    """What workers need for a part: contexts float32 (N, D), seeds, policies, and of each setup its rewards (N, P, R) and its streams."""
+    """What workers need for a part: contexts float32 (N, D), seeds, policies, prices (N, P, R) if there are budgets, and of each setup its rewards
+    (N, P, R) and its streams."""
 
     contexts: NDArray[np.float32]
     seeds: tuple[int, ...]
@@ -76,6 +81,7 @@ class _Material:
     setups: tuple[Setup, ...]
     rewards: tuple[NDArray[np.float64], ...]
     streams: tuple[Streams, ...]
+    prices: NDArray[np.float64] | None = None
 
 
 _Job = tuple[int, int, str, int]
@@ -120,7 +126,8 @@ def replay_parts(
 def _material(part: Part) -> _Material:
     tables = tuple(part.log.rewards(setup.weights) for setup in part.setups)
     streams = tuple(draw_streams(table, part.seeds, part.decisions) for table in tables)
-    return _Material(part.log.contexts, tuple(part.seeds), part.log.policies, tuple(part.setups), tables, streams)
+    prices = part.log.price if any(setup.budget is not None for setup in part.setups) else None
+    return _Material(part.log.contexts, tuple(part.seeds), part.log.policies, tuple(part.setups), tables, streams, prices)
 
 
 def _collected(
@@ -160,6 +167,7 @@ def replay_one(
     seed: int,
     warm_start: WarmStart | None = None,
     factory: SelectorFactory | None = None,
+    within: Within | None = None,
     **settings: Any,
 ) -> NDArray[np.int16]:
     """Show one stream to one selector, which sees the reward of its choices only.
@@ -168,10 +176,11 @@ def replay_one(
         contexts: (T, D). rewards: (T, P).
         warm_start: shown first, in an order of the seed's.
         factory: makes the selector; None: the registry does.
+        within: a budget to keep to.
         settings: of the selector.
 
     Returns:
-        columns chosen, (T,).
+        columns chosen, (T,); -1 from where a budget pays for nothing.
     """
     from osel_sim.selection.ppo.compiled import FastPPO, supports
     from osel_sim.selection.ppo.sb3 import PPOSelector
@@ -181,6 +190,8 @@ def replay_one(
     selector = make_selector(name, policies, size, seed, **settings) if factory is None else factory(policies, size, seed)
     if warm_start is not None:
         show(selector, warm_start, policies, seed)
+    if within is not None:
+        return within.play(selector, contexts, rewards, seed)
     if isinstance(selector, PPOSelector) and supports(selector):
         return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
     column = {policy: index for index, policy in enumerate(policies)}
@@ -202,7 +213,7 @@ def _run(
     if workers == 1:
         ready()
         for job in jobs:
-            with _one_thread():  # not around all of them: what is made of a part in between is not part of it
+            with one_thread():  # not around all of them: what is made of a part in between is not part of it
                 result = _replay_job(materials, factories, job)
             yield result
         return
@@ -213,10 +224,15 @@ def _run(
             yield event.value
 
 
-def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
-    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
+def one_thread_worker() -> None:
+    """Compute on one thread in this worker from now on."""
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
     threadpool_limits(1)
+
+
+def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
+    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
+    one_thread_worker()
     return lambda job, _: [_replay_job(materials, factories, job)]
 
 
@@ -229,11 +245,14 @@ def _replay_job(materials: Sequence[_Material], factories: Mapping[str, Selector
     contexts.flags.writeable = False
     kind, shown = name.removesuffix(WARM), setup.warm_start if name.endswith(WARM) else None
     seed, factory = material.seeds[number], factories.get(name)
-    return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, **setup.settings.get(name, {}))
+    within = None
+    if setup.budget is not None and material.prices is not None:
+        within = Within(setup.budget, streams.rewards(material.prices, number))
+    return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, within, **setup.settings.get(name, {}))
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
     import torch
 

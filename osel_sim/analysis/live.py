@@ -156,6 +156,6 @@ def _check(decision: Decision, configuration: Mapping[str, Any], there: Sequence
 
 
 def _row(decision: Decision, policy: str, outcome: Outcome) -> Row:
-    own = {key: value for key, value in vars(outcome).items() if key != "seconds"}
+    own = {key: value for key, value in vars(outcome).items() if key not in ("seconds", "monitored")}
     about: dict[str, Any] = {name: getattr(decision, name) for name in ABOUT}
     return Row(**about, instance=decision.instance, policy=policy, repeat=0, **own, **vars(outcome.seconds))

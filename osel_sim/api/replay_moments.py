@@ -22,7 +22,10 @@ SELECTORS = ("auto", "auto:warm")
 """Start selectors that are compared unless others are named."""
 MONITORS = ("stall", "disagreement", "value")
 """Monitors that are compared unless others are named."""
-_NOT_HERE = ("decisions", "unknown_costs", "unknown_skills", "no_frontier", "route_with", "targets", "context", "join", "leave", "drift")
+_NOT_HERE = (
+    *("decisions", "unknown_costs", "unknown_skills", "no_frontier", "route_with", "targets", "context", "join", "leave", "drift"),
+    *("budget_cents", "budget_per", "robots", "share", "share_delay", "robots_by"),
+)
 """Settings of other replays."""
 
 
