@@ -26,8 +26,9 @@ EXAMPLES = """examples:
   python -m osel_sim.run --config runs/first/run.json --seed 1 --out runs/second   # another run with the same settings
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
-points.jsonl (what a monitor saw), contexts.npz, selector.safetensors, summary.json, curve.png, videos/, and report.html, the page about it, with
-figures/ and tables/ beside it; budget.json with --budget-cents, and warnings.jsonl where something changed that nobody announced.
+points.jsonl (what a monitor saw), events.jsonl (policies that joined or left), contexts.npz, selector.safetensors, summary.json, curve.png,
+videos/, and report.html, the page about it, with figures/ and tables/ beside it; budget.json with --budget-cents, and warnings.jsonl where something
+changed that nobody announced.
 Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 
 

@@ -1,6 +1,8 @@
 """Policies that join and leave a live run: journals, what is refused, what readers make of it."""
 
 import json
+import random
+import re
 import shutil
 import signal
 import subprocess
@@ -9,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_helpers import environment, make_world, wait_for_lines
+from run_helpers import environment, wait_for_lines
 
 import osel_sim
 from osel_sim.analysis.live import read_live
@@ -24,12 +26,56 @@ from osel_sim.run import main as run_main
 FIRST, SECOND, THIRD = 3, 6, 8
 
 
+POLICY = """version = 1
+name = "{name}"
+title = "test"
+location = "local"
+kind = "toy_{kind}"
+execute = 4
+inference_seconds = 0.01
+
+[observation]
+cameras = ["top"]
+image_size = 64
+"""
+
+ENCODER = """
+import numpy as np
+
+
+class Letters:
+    name = identity = "letters"
+    dimension, image_size = 26, 64
+
+    def encode(self, images, instruction):
+        return np.array([instruction.lower().count(letter) / len(instruction) for letter in "abcdefghijklmnopqrstuvwxyz"], np.float32)
+"""
+POINTS = """[osel_sim.suites]
+toy = toy_suite:Toy
+[osel_sim.policies]
+toy_greedy = toy_policies:load_greedy
+toy_reader = toy_policies:load_reader
+[osel_sim.encoders]
+letters = letters:Letters
+"""
+
+
 @pytest.fixture(scope="module")
 def world(tmp_path_factory):
+    """Two local policies of the toy suite, `calm` and `brisk`: no simulator, no server."""
+    folder = tmp_path_factory.mktemp("world")
+    plugin, info = folder / "plugin", folder / "plugin" / "toy_suite-1.0.dist-info"
+    info.mkdir(parents=True)
+    for name in ("toy_suite.py", "toy_policies.py"):
+        shutil.copy(Path(__file__).parent / "toy_suite" / name, plugin)
+    (plugin / "letters.py").write_text(ENCODER)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-suite\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(POINTS)
+    (folder / "policies").mkdir()
+    for name, kind in (("calm", "greedy"), ("brisk", "reader")):
+        (folder / "policies" / f"{name}.toml").write_text(POLICY.format(name=name, kind=kind))
     with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])  # of servers that are started from here
+        patch.syspath_prepend(str(plugin))
         yield folder
 
 
@@ -37,7 +83,7 @@ def world(tmp_path_factory):
 def begun(world) -> Path:
     """A run of one policy, of some decisions."""
     folder = world / "begun"
-    flags = ["--task", "short", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--policies", "calm", "--encoder", "colours"]
+    flags = ["--task", "toy:reach", "--policies-dir", world / "policies", "--policies", "calm", "--encoder", "letters"]
     flags += ["--selector", "thompson", "--counterfactual", "--no-page", "--episodes", FIRST, "--out", folder]
     assert run_main(list(map(str, flags))) == 0
     return folder
@@ -58,9 +104,9 @@ def changed(world, begun) -> tuple[Path, Told]:
     """It went on with another policy, and at last without the first."""
     folder, told = world / "changed", Told()
     shutil.copytree(begun, folder)
-    osel_sim.run(out=folder, resume=True, episodes=SECOND, add_policies="wild", no_page=True, subscribers=[told])
+    osel_sim.run(out=folder, resume=True, episodes=SECOND, add_policies="brisk", no_page=True, subscribers=[told])
     shutil.copytree(folder, world / "joined")
-    osel_sim.run(out=folder, resume=True, episodes=THIRD, retire="calm", subscribers=[told])
+    osel_sim.run(out=folder, resume=True, episodes=THIRD, retire="calm", no_page=False, subscribers=[told])
     return folder, told
 
 
@@ -71,24 +117,24 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 def test_policies_join_and_leave(changed):
     folder, told = changed
-    words = ["wild joins before decision 3", "calm retires before decision 6"]
+    words = ["brisk joins before decision 3", "calm retires before decision 6"]
     assert told.words == words
     decisions = read_journal(folder / "episodes.jsonl")
-    assert [tuple(decision.propensities) for decision in decisions] == [("calm",)] * 3 + [("calm", "wild")] * 3 + [("wild",)] * 2
+    assert [tuple(decision.propensities) for decision in decisions] == [("calm",)] * 3 + [("calm", "brisk")] * 3 + [("brisk",)] * 2
     assert [change.words for change in read_changes(folder, ["calm"])] == words
     noted = json.loads((folder / "run.json").read_text())
-    assert noted["events"] == [{"before": 3, "event": "add", "policy": "wild"}, {"before": 6, "event": "retire", "policy": "calm"}]
+    assert noted["events"] == [{"before": 3, "event": "add", "policy": "brisk"}, {"before": 6, "event": "retire", "policy": "calm"}]
     assert noted["configuration"]["policies"] == ["calm"] and noted["configuration"]["episodes"] == THIRD
     live = read_live(folder)
-    assert live.outcomes.policies == ("calm", "wild")
+    assert live.outcomes.policies == ("calm", "brisk")
     assert (live.propensities[:3, 1] == 0.0).all() and (live.propensities[6:, 0] == 0.0).all()
     assert np.isfinite(live.outcomes.success).all(axis=(1, 2)).tolist() == [False] * 3 + [True] * 3 + [False] * 2
-    assert set(json.loads((folder / "summary.json").read_text())["policies"]) == {"calm", "wild"}
+    assert set(json.loads((folder / "summary.json").read_text())["policies"]) == {"calm", "brisk"}
 
 
 def test_the_page_tells_of_them(changed):
     page = (changed[0] / "report.html").read_text()
-    assert "wild joins before decision 3" in page
+    assert "brisk joins before decision 3" in page
     assert (changed[0] / "tables" / "changes.csv").read_text().splitlines()[0].startswith("before,event,policy")
 
 
@@ -101,7 +147,7 @@ def test_such_a_run_is_replayed_where_all_policies_ran(changed, tmp_path):
 def test_killed_and_resumed_gives_the_same_bytes(world, begun, changed):
     folder = world / "killed"
     shutil.copytree(begun, folder)
-    flags = ["--out", folder, "--resume", "--episodes", SECOND, "--add-policies", "wild", "--no-page"]
+    flags = ["--out", folder, "--resume", "--episodes", SECOND, "--add-policies", "brisk", "--no-page"]
     words = [sys.executable, "-m", "osel_sim.run", *map(str, flags)]
     process = subprocess.Popen(words, env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     wait_for_lines(process, folder / "episodes.jsonl", FIRST + 1)
@@ -128,13 +174,13 @@ def test_a_run_killed_before_run_json_said_so_goes_on(world, changed):
 @pytest.mark.parametrize(
     ("flags", "complaint"),
     [
-        (["--add-policies", "wilt"], "unknown policy 'wilt': did you mean 'wild'"),
+        (["--add-policies", "brisl"], "unknown policy 'brisl': did you mean 'brisk'"),
         (["--add-policies", "calm"], "the run has had it from the beginning"),
-        (["--add-policies", "wild", "wild"], "named twice after --add-policies"),
-        (["--add-policies", "wild", "--retire", "wild"], "leave one of them out"),
+        (["--add-policies", "brisk", "brisk"], "named twice after --add-policies"),
+        (["--add-policies", "brisk", "--retire", "brisk"], "leave one of them out"),
         (["--retire", "clam"], "did you mean 'calm'"),
         (["--retire", "calm"], "the last one to choose from"),
-        (["--add-policies", "wild", "--episodes", FIRST], "has made all its 3 decisions"),
+        (["--add-policies", "brisk", "--episodes", FIRST], "has made all its 3 decisions"),
     ],
 )
 def test_what_cannot_be_changed_is_one_line(begun, capsys, flags, complaint):
@@ -152,17 +198,17 @@ def bytes_of_begun(folder: Path) -> dict[str, bytes]:
 
 def test_more_that_cannot_be_changed(world, changed, tmp_path, capsys):
     joined = world / "joined"
-    assert run_main(["--out", str(joined), "--resume", "--episodes", "9", "--add-policies", "wild"]) == 2
+    assert run_main(["--out", str(joined), "--resume", "--episodes", "9", "--add-policies", "brisk"]) == 2
     assert "has had it since decision 3" in capsys.readouterr().err
-    flags = ["--task", "short", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--out", tmp_path / "new"]
-    assert run_main([*map(str, flags), "--add-policies", "wild"]) == 2
+    flags = ["--task", "toy:reach", "--policies-dir", world / "policies", "--out", tmp_path / "new"]
+    assert run_main([*map(str, flags), "--add-policies", "brisk"]) == 2
     assert "add --resume" in capsys.readouterr().err
-    file = world / "policies" / "wild.toml"
+    file = world / "policies" / "brisk.toml"
     text = file.read_text()
     try:
         file.write_text(text + "# another\n")
         assert run_main(["--out", str(joined), "--resume", "--episodes", "9"]) == 2
-        assert "when wild joined" in capsys.readouterr().err
+        assert "when brisk joined" in capsys.readouterr().err
     finally:
         file.write_text(text)
 
@@ -199,6 +245,24 @@ def test_a_damaged_file_of_events_is_refused(tmp_path, damage, complaint):
     file.write_text("".join(damage(file.read_text().splitlines(keepends=True))))
     with pytest.raises(DataError, match=complaint):
         read_changes(tmp_path, ["a"])
+
+
+def test_no_bit_of_a_file_of_events_can_flip_unseen(tmp_path):
+    changes = make_changes(tmp_path)
+    file, chance = tmp_path / EVENTS, random.Random(0)
+    raw = file.read_bytes()
+    for _ in range(300):
+        place = chance.randrange(len(raw))
+        for other in (bytes([raw[place] ^ 1 << chance.randrange(8)]), b"\n"):
+            file.write_bytes(damaged := raw[:place] + other + raw[place + 1 :])
+            if damaged != raw:
+                with pytest.raises(DataError, match=re.escape(str(file))):
+                    read_changes(tmp_path, ["a"])
+        file.write_bytes(raw[:place])
+        with pytest.raises(DataError, match=re.escape(str(file))):
+            read_changes(tmp_path, ["a"])
+    file.write_bytes(raw)
+    assert list(read_changes(tmp_path, ["a"])) == changes
 
 
 class Stranger:

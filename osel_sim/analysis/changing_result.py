@@ -100,9 +100,9 @@ def _arrival(name: str, newcomer: Mapping[str, Any]) -> str:
     fair = f"its fair share, {100 * FAIR * share:.0f}% of the decisions"
     if after["through"] is None:
         return f"{name} does not give {policy} {fair}, in the {newcomer['of']} after it joins"
-    began = after["afresh"] if after["afresh"] is not None else f"not in the {newcomer['of']} there are"
     soon = f"{after['through']} decisions after it joins" if after["through"] else "as soon as it joins"
-    return f"{name} gives {policy} {fair}, {soon} (begun afresh: {began})"
+    began = {None: f"not in the {newcomer['of']} that there are", 0: "at once"}.get(after["afresh"], f"after {after['afresh']}")
+    return f"{name} gives {policy} {fair}, {soon} (one begun afresh: {began})"
 
 
 def _ends_words(ends: Sequence[float] | None) -> str:

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from osel_sim.analysis.budgets import BudgetPlan
     from osel_sim.analysis.engine import Setup
     from osel_sim.analysis.log import LoggedOutcomes
-    from osel_sim.api.replay import ReplayConfig
+    from osel_sim.api.replay_settings import ReplayConfig
 
 WITHIN = ("auto",)
 """Selectors that are replayed within budgets unless others are named: each takes as long again for every budget."""

@@ -30,8 +30,8 @@ def check_all_outcomes(config: "ReplayConfig", known: bool) -> None:
     """
     if changes_asked(config) and not known:
         raise UsageError(
-            f"--join, --leave and --drift replay selectors, which needs the outcomes of every policy: {config.log} has those of what was chosen "
-            "only; record one (python -m osel_sim.record), or make the run with --counterfactual"
+            f"--join, --leave and --drift replay selectors, which needs the outcomes of every policy: {config.log} does not have them; "
+            "record a log (python -m osel_sim.record), or make the run with --counterfactual"
         )
 
 

@@ -42,7 +42,10 @@ class Choice:
 class Selector(Protocol):
     """Chooses among `policies`. `select` and `update` alternate, or lag behind each other where episodes run at once."""
 
-    policies: tuple[str, ...]
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Names of those that are available now."""
+        ...
 
     def select(self, context: Context) -> Choice:
         """Choose a policy for an instance."""
