@@ -74,8 +74,8 @@ def plan(config: "RunConfig", initial: "Sequence[PolicySpec]", environment: "Env
     names, file = [spec.name for spec in initial], config.folder / JOURNAL
     made = read_changes(config.folder, names)
     decisions = file.read_bytes().count(b"\n") if file.is_file() else 0
-    for flag, given in (("--monitor", config.monitor is not None), ("--robots", config.robots > 1)):
-        if given and (config.add_policies or config.retire):
+    for flag, choosing in (("--monitor", config.monitor is not None), ("--robots", config.robots > 1)):
+        if choosing and (config.add_policies or config.retire):
             raise UsageError(f"policies of a run with {flag} do not come and go; begin a new run with the policies that there are now")
     asked = _asked(config, names, made, decisions, environment, objects)
     if asked and config.monitor is not None:
