@@ -1,4 +1,4 @@
-# make run | suites | test | slow | stock | lint | docs | bench | policies | wheel | schemas | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
+# make run | suites | test | slow | stock | cluster | lint | docs | bench | policies | wheel | schemas | requirements | clean. Each sets up what it needs: Python's own venv in .venv, pinned packages from requirements.txt.
 
 PYTHON := .venv/bin/python
 READY := .venv/.ready
@@ -17,7 +17,7 @@ EPISODES ?= 240
 INSTANCES ?= 50
 POLICIES := local_small remote_specialist remote_base remote_large
 
-.PHONY: suites run test slow stock lint docs bench policies wheel schemas requirements environment clean
+.PHONY: suites run test slow stock cluster lint docs bench policies wheel schemas requirements environment clean
 
 run: $(READY)
 	$(PYTHON) -m osel_sim.run --task pick_place --policies local_small remote_large --counterfactual --video 3 --out $(OUT) $(ARGS)
@@ -35,6 +35,14 @@ stock: $(READY)
 	[ requirements-stock.txt -ot $(STOCK)/.ready ] || { \
 		.venv/bin/uv pip install --quiet --compile-bytecode --python $(PYTHON) --no-deps --target $(STOCK) -r requirements-stock.txt && touch $(STOCK)/.ready; }
 	PYTHONPATH=$(STOCK) $(ONE_THREAD) $(PYTHON) -m pytest tests/test_stock_policies.py $(ARGS)
+
+# Likewise submitit and Ray, all of whose other needs are pinned already.
+CLUSTER := .venv/cluster
+
+cluster: $(READY)
+	[ requirements-cluster.txt -ot $(CLUSTER)/.ready ] || { \
+		.venv/bin/uv pip install --quiet --python $(PYTHON) --no-deps --target $(CLUSTER) -r requirements-cluster.txt && touch $(CLUSTER)/.ready; }
+	PYTHONPATH=$(CLUSTER) $(ONE_THREAD) $(PYTHON) -m pytest tests/test_cluster.py $(ARGS)
 
 lint: $(READY)
 	.venv/bin/ruff check .

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from osel_sim.analysis.engine import _one_thread, replay_one
+from osel_sim.analysis.engine import one_thread, replay_one
 
 POLICIES = ("local", "remote")
 PARTS = ("ppo", "bound", "auto", "whole")
@@ -54,7 +54,7 @@ def measure_ppo(options: argparse.Namespace) -> dict[str, float]:
     replay_one("ppo", contexts[:10], rewards[:10], POLICIES, 0)  # compile
     sb3(contexts[:10], rewards[:10], 0)
     theirs = ours = 0.0
-    with _one_thread():
+    with one_thread():
         for seed in range(options.sb3_seeds):
             theirs += own_time(partial(sb3, contexts, rewards, seed)) - own_time(partial(sb3, contexts[:5], rewards[:5], seed))
             ours += own_time(partial(replay_one, "ppo", contexts, rewards, POLICIES, seed))
@@ -118,7 +118,7 @@ def measure_auto(options: argparse.Namespace) -> dict[str, float]:
     streams = draw_streams(log.rewards(weights), [0])
     contexts, rewards = log.contexts[streams.order[0]], streams.rewards(log.rewards(weights), 0)
     told = {"expected_costs": log.expected_costs(weights)} | ({} if log.skills is None else {"skills": log.skills})
-    with _one_thread():
+    with one_thread():
         replay_one("auto", contexts[:50], rewards[:50], log.policies, 0, **told)
         seconds = own_time(lambda: replay_one("auto", contexts, rewards, log.policies, 0, **told))
     print(f"auto: {len(log) / seconds:.0f} decisions/s, {len(log)} of them between {len(log.policies)} policies")

@@ -135,6 +135,22 @@ def change(decisions: int, generator: np.random.Generator, dim: int = 64) -> Pro
     return _drawn(generator.normal(size=(decisions, dim)) / np.sqrt(dim), rates, generator)
 
 
+def changed(
+    before: tuple[float, ...], after: tuple[float, ...], decisions: int, generator: np.random.Generator, at: float = 0.5, dim: int = 64
+) -> Problem:
+    """Rates before and after a moment that nobody announces, in shares of the stream; the context says nothing of it."""
+    rates = np.where(np.arange(decisions)[:, None] < at * decisions, before, after)
+    return _drawn(generator.normal(size=(decisions, dim)) / np.sqrt(dim), rates, generator)
+
+
+def clusters_swapped(decisions: int, generator: np.random.Generator) -> Problem:
+    """Halfway two of the policies change places in every cluster of contexts."""
+    problem = clusters(decisions, generator, dim=64, count=10)
+    late, places = np.arange(decisions) >= decisions // 2, [1, 0, 2, 3]
+    tables = (np.where(late[:, None], table[:, places], table) for table in (problem.expected, problem.rewards))
+    return Problem(problem.contexts, *tables)
+
+
 def repeats(texts: int, each: int, generator: np.random.Generator, dim: int = 128) -> Problem:
     """The same few contexts again and again, with rates of their own."""
     contexts = generator.normal(size=(texts, dim)) / np.sqrt(dim)
@@ -186,5 +202,9 @@ PROBLEMS: dict[str, Make] = {
     "exclusive or": partial(exclusive_or, 2000),
     "drift": partial(drift, 2000),
     "change": partial(change, 2000),
+    "swap": partial(changed, (0.8, 0.3, 0.5), (0.3, 0.8, 0.5), 2000),
+    "one gets worse": partial(changed, (0.78, 0.6, 0.5), (0.51, 0.6, 0.5), 2000, at=0.4),
+    "one gets better": partial(changed, (0.6, 0.4, 0.3), (0.6, 0.9, 0.3), 3000, at=0.33),
+    "clusters, swap": partial(clusters_swapped, 3000),
     "repeated texts": partial(repeats, 60, 20),
 }

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from osel_sim.api.collect import CollectConfig, collect
     from osel_sim.api.compare import CompareConfig, compare
     from osel_sim.api.ingest import IngestConfig, ingest
+    from osel_sim.api.merge import MergeConfig, merge
     from osel_sim.api.parts import load_log, load_policy, make_env, make_selector
     from osel_sim.api.record import record
     from osel_sim.api.record_settings import RecordConfig
@@ -40,6 +41,7 @@ _PLACES = {
     "CollectConfig": "api.collect",
     "CompareConfig": "api.compare",
     "IngestConfig": "api.ingest",
+    "MergeConfig": "api.merge",
     "OselError": "core.errors",
     "RecordConfig": "api.record_settings",
     "ReplayConfig": "api.replay_settings",
@@ -54,6 +56,7 @@ _PLACES = {
     "load_policy": "api.parts",
     "make_env": "api.parts",
     "make_selector": "api.parts",
+    "merge": "api.merge",
     "record": "api.record",
     "replay": "api.replay",
     "report": "api.report",
@@ -64,6 +67,7 @@ __all__ = [
     "CollectConfig",
     "CompareConfig",
     "IngestConfig",
+    "MergeConfig",
     "OselError",
     "RecordConfig",
     "ReplayConfig",
@@ -78,6 +82,7 @@ __all__ = [
     "load_policy",
     "make_env",
     "make_selector",
+    "merge",
     "record",
     "replay",
     "report",

@@ -9,6 +9,7 @@ from osel_sim.core import this_python
 COMMANDS = {
     "run": "let a selector choose live which policy handles each instance",
     "record": "run every policy on the same instances: a rollout log",
+    "merge": "put the shards of a recording together",
     "replay": "show a log to selectors: is routing worth it?",
     "compare": "did a policy get worse? paired differences and a verdict",
     "report": "one page about a run, a replay or a log",

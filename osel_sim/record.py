@@ -23,13 +23,16 @@ EXAMPLES = """examples:
   python -m osel_sim.record --task pick_place --policies old new --instances 500 --until-decided --out logs/which    # stop as soon as it is told
   python -m osel_sim.record --policies new --baseline logs/old --until-decided --out logs/new     # the same, against a log, on its instances
   python -m osel_sim.record --task lift --instances 20 --policies local_small remote_large --moments 6 --out logs/moments     # when to hand over
+  python -m osel_sim.record --task all --instances 300 --shard 3/40 --out shards/3         # a part, for osel_sim.merge
+  python -m osel_sim.record --task all --instances 300 --cluster slurm --shards 40 --cluster-option slurm_partition=gpu --out logs/suite
   python -m osel_sim.record --summary logs/mine                                            # print the tables of a log again
 
 Writes into --out: run.json, rollouts.parquet (a row an episode) and contexts.npz. Every policy starts from the same state of the same instance. The
 files do not depend on the number of workers, nor on interruptions. --resume takes all settings from run.json; policies, more
 repeats and an encoder given with it are added to what is there, and the log is read with the encoder given last.
 --moments K cuts every episode before every K-th call and lets every other policy drive on from there: moments.parquet, which replay reads.
---until-decided looks after every 10 instances or more, --instances being the most; docs/compare.md says why such looks are honest."""
+--until-decided looks after every 10 instances or more, --instances being the most; docs/compare.md says why such looks are honest.
+--cluster sends the shards to Slurm or Ray, those that fail again (--retries), and merges them; --resume sends what is missing (docs/cluster.md)."""
 
 
 def _execute(config: RecordConfig) -> int:
@@ -38,9 +41,8 @@ def _execute(config: RecordConfig) -> int:
     result = record(config)
     if result.recorded:
         hourly = 3600 * result.recorded / result.seconds
-        print(
-            f"{result.recorded} episodes in {result.seconds:.0f} s with {config.workers} workers: {hourly:.0f} episodes an hour, starting up included"
-        )
+        how = f"in {config.shards} shards" if config.cluster and config.shards else f"with {config.workers} workers"
+        print(f"{result.recorded} episodes in {result.seconds:.0f} s {how}: {hourly:.0f} episodes an hour, starting up included")
     _print_summary(result.folder)
     print(f"written to {result.folder}")
     if result.planned:

@@ -10,7 +10,9 @@ EXAMPLES = """examples:
   python -m osel_sim.replay assets/logs/pick_place                                   # every selector there is, 20 seeds
   python -m osel_sim.replay assets/logs/pick_place --selectors ppo ucb1 --preset waymo --out runs/ppo
   python -m osel_sim.replay assets/logs/suite --half score --selectors auto auto:warm   # without and with the outcomes of the other half beforehand
+  python -m osel_sim.replay assets/logs/suite --selectors auto --budget-cents 5000   # what as much money buys, at best and by auto
   python -m osel_sim.replay logs/mine --alpha-time 0.1 --alpha-price 0.005 --seeds 5 --decisions 500 --no-frontier   # a quick look
+  python -m osel_sim.replay assets/logs/suite --selectors linucb --robots 4 --share every:20   # what do four robots gain by sharing?
   python -m osel_sim.replay assets/logs/suite --selectors auto linucb --join remote_large@500 --leave remote_large@1200   # a policy comes and goes
   python -m osel_sim.replay assets/logs/suite --selectors auto --drift price:remote_large:x2@800 remote_large=local_small@1200   # dearer, then worse
   python -m osel_sim.replay assets/logs/moments                                      # when to hand over within an episode, and to whom
@@ -25,6 +27,8 @@ With --half a selector that learns off-policy can be shown all outcomes of the o
 A verdict comes first, from auto, linucb and the fixed policies; then all other selectors are replayed, of which the paper's PPO takes longest, and
 at last all of them at other weights of time and price, for the frontier (--no-frontier leaves that out). After each of the three what is known so far
 is written, page included with --open: Ctrl-C loses no more than what is being replayed.
+
+With --budget-cents selectors are replayed within that budget, too, and within quarters to four times of it: auto, unless --selectors names others.
 
 Writes into --out: replay.json, choices.npz (every choice), selectors.csv, oracles.csv, paired.csv, frontier.csv. Of a live run's folder it estimates
 what each fixed policy, random choice and a linear model would have earned (off_policy.json), and replays if the run has --counterfactual outcomes.
@@ -56,7 +60,8 @@ def _print(result: ReplayResult) -> None:
     from osel_sim.cli.changes_tables import print_changes
     from osel_sim.cli.console import console
     from osel_sim.cli.replay_tables import print_off_policy, print_replay, print_so_far
-    from osel_sim.formats.replay_result import CHANGES
+    from osel_sim.cli.sharing_table import print_sharing
+    from osel_sim.formats.replay_result import CHANGES, SHARING
 
     if result.result is not None and result.pending:
         print_so_far(console(), result.result)
@@ -67,6 +72,8 @@ def _print(result: ReplayResult) -> None:
         print_changes(console(), result.result)
     elif result.result is not None:
         print_replay(console(), result.result)
+        if SHARING in result.result:
+            print_sharing(console(), result.result[SHARING])
     else:
         print("Only the outcomes of what was chosen are known, so selectors cannot be replayed (a live run has all with --counterfactual).")
 

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim.api.run_settings import RunConfig
 from osel_sim.cli.command import INTERRUPTED, Command
+from osel_sim.core.errors import BudgetError
+from osel_sim.core.shown import shown
 
 if TYPE_CHECKING:
     from osel_sim.api.results import RunResult
@@ -16,6 +18,7 @@ EXAMPLES = """examples:
   python -m osel_sim.run --task tag:short --level 0 2 --episodes 200       # several tasks and levels, mixed
   python -m osel_sim.run --task all --level 0 2 --selector auto --encoder osel_suite --warm-start assets/logs/suite   # it has seen a log's outcomes
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
+  python -m osel_sim.run --task pick_place --selector auto --episodes 200 --budget-cents 500   # never spends more, and says what a dollar would buy
   python -m osel_sim.run --task open_drawer --policies local_small remote_specialist --monitor value   # and who drives on, within the episode
   python -m osel_sim.run --out runs/first --resume                         # goes on with it, if it was cut off
   python -m osel_sim.run --out runs/first --resume --episodes 200          # and on, to more decisions
@@ -24,7 +27,7 @@ EXAMPLES = """examples:
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
 points.jsonl (what a monitor saw), contexts.npz, selector.safetensors, summary.json, curve.png, videos/, and report.html, the page about it, with
-figures/ and tables/ beside it.
+figures/ and tables/ beside it; budget.json with --budget-cents, and warnings.jsonl where something changed that nobody announced.
 Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 
 
@@ -41,9 +44,14 @@ def _execute(config: RunConfig) -> int:
             console().print(plain(monitor_words(config.monitor, result.summary)), soft_wrap=True)
         if result.verdict:
             console().print(plain(result.verdict, "bold"), soft_wrap=True)
+        if result.spent:
+            console().print(plain(f"{result.spent.sentence}."), soft_wrap=True)
         print_causes((decision.policy, f"decision {decision.index}", decision.error) for decision in result.journal if decision.error)
         print(f"written to {result.folder}" + (f"; {result.page} shows it" if result.page else ""))
     _print_next(config, result)
+    if result.spent and result.spent.ended:
+        print(f"ended after {len(result.journal)} of {config.episodes} decisions: {shown(result.spent.ended)}", file=sys.stderr)
+        return BudgetError.exit_code
     return INTERRUPTED if result.interrupted else 0
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from websockets.sync.server import ServerConnection, serve
 
 from osel_sim.formats.policy_file import PolicySpec, load_policy_file
-from osel_sim.interface.policy import Actions, Observation
+from osel_sim.interface.policy import Actions, Observation, Policy
 from osel_sim.interface.specification import specification
+from osel_sim.remote.batching import Batching
 from osel_sim.remote.codec import pack
 from osel_sim.remote.protocol import Greeting, example_observation
 from osel_sim.remote.server import PolicyServer
@@ -117,7 +118,7 @@ def install_plugin(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def serving(make_session: Callable[[], Sinusoid] = Sinusoid, greeting: Greeting = GREETING) -> Iterator[str]:
+def serving(make_session: Callable[[], Policy] = Sinusoid, greeting: Greeting = GREETING, batching: Batching | None = None) -> Iterator[str]:
     """Our server in a thread; its address."""
     started, stop_server = threading.Event(), []
     address: list[str] = []
@@ -129,7 +130,7 @@ def serving(make_session: Callable[[], Sinusoid] = Sinusoid, greeting: Greeting 
     async def run() -> None:
         loop, stop = asyncio.get_running_loop(), asyncio.Event()
         stop_server.append(lambda: loop.call_soon_threadsafe(stop.set))
-        await PolicyServer(make_session, greeting, TOKEN).run(stop, ready)
+        await PolicyServer(make_session, greeting, TOKEN, batching=batching).run(stop, ready)
 
     thread = threading.Thread(target=lambda: asyncio.run(run()))
     thread.start()

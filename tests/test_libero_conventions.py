@@ -25,7 +25,7 @@ from osel_sim.policy.history import split
 from osel_sim.policy.mapping import grip_orientation, hand_orientation, image_of, message_of
 from osel_sim.remote.codec import pack, unpack
 from osel_sim.remote.protocol import Greeting, ObservationError, example_observation
-from osel_sim.remote.server import Session
+from osel_sim.remote.session import Session
 from osel_sim.sim.env import TaskEnv
 
 RENDERED = 256

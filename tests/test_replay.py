@@ -414,3 +414,12 @@ def _rows(folder: Path):
     from osel_sim.formats.rollout_log import read_rollouts
 
     return read_rollouts(folder)[0]
+
+
+def test_a_warm_start_is_part_of_the_first_verdict_where_it_is_quick():
+    from osel_sim.api.replay import WARM_SOON, _stages
+
+    names = ["auto", "auto:warm", "linucb", "ppo"]
+    assert _stages(names, WARM_SOON) == [["auto", "auto:warm", "linucb"], ["ppo"]]
+    assert _stages(names, WARM_SOON + 1) == [["auto", "linucb"], ["auto:warm", "ppo"]]
+    assert _stages(["auto:warm"], 10**6) == [["auto:warm"]]

@@ -169,7 +169,7 @@ def test_a_suite_that_forgets_nothing_is_found_out(monkeypatch):
         check_task(find_task("toy:reach"))
 
 
-@pytest.mark.parametrize(("told", "message"), [(lambda env: "same", "must tell the instances of two seeds apart"), (lambda env: "", "not empty")])
+@pytest.mark.parametrize(("told", "message"), [(lambda env: "same", "must tell the instances of two seeds apart"), (lambda env: 7, "must be text")])
 def test_a_scene_that_is_not_told_from_others_is_found_out(monkeypatch, told, message):
     import toy_suite
 

@@ -16,7 +16,7 @@ from test_record import files, resume
 import osel_sim as osel
 from osel_sim.analysis.log import read_outcomes
 from osel_sim.analysis.until_decided import UntilDecided, seeds_a_look
-from osel_sim.api.record import _check_stopping
+from osel_sim.api.record_here import _check_stopping
 from osel_sim.api.record_settings import RecordConfig
 from osel_sim.core.errors import DataError, SettingError, UsageError
 from osel_sim.episodes.workers import Plan, make_row

@@ -2,8 +2,8 @@
 
 import os
 from collections import Counter
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -15,11 +15,13 @@ from threadpoolctl import threadpool_limits
 from osel_sim.analysis.log import LoggedOutcomes
 from osel_sim.analysis.streams import Streams, draw_streams
 from osel_sim.analysis.warm_start import WarmStart, show
+from osel_sim.analysis.within_budget import Within
 from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
 from osel_sim.core.torch_settings import threads_where_imported
 from osel_sim.formats.replay_result import Choices
 from osel_sim.interface.selector import Selector, SelectorFactory
+from osel_sim.selection.budget import Budget
 from osel_sim.selection.reward import RewardWeights
 
 WARM = ":warm"
@@ -37,11 +39,13 @@ class Setup:
         weights: of the reward.
         settings: selector -> keyword arguments, where they are not to be the defaults.
         warm_start: of other instances than the log's; needed for selectors named `NAME:warm`.
+        budget: that all selectors keep to; None: they may spend what they like.
     """
 
     weights: RewardWeights
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     warm_start: WarmStart | None = None
+    budget: Budget | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,8 @@ class Part:
 
 @dataclass(frozen=True)
 class _Material:
-    """What workers need for a part: contexts float32 (N, D), seeds, policies, and of each setup its rewards (N, P, R) and its streams."""
+    """What workers need for a part: contexts float32 (N, D), seeds, policies, prices (N, P, R) if there are budgets, and of each setup its rewards
+    (N, P, R) and its streams."""
 
     contexts: NDArray[np.float32]
     seeds: tuple[int, ...]
@@ -77,6 +82,7 @@ class _Material:
     setups: tuple[Setup, ...]
     rewards: tuple[NDArray[np.float64], ...]
     streams: tuple[Streams, ...]
+    prices: NDArray[np.float64] | None = None
 
 
 _Job = tuple[int, int, str, int]
@@ -121,7 +127,8 @@ def replay_parts(
 def _material(part: Part) -> _Material:
     tables = tuple(part.log.rewards(setup.weights) for setup in part.setups)
     streams = tuple(draw_streams(table, part.seeds, part.decisions) for table in tables)
-    return _Material(part.log.contexts, tuple(part.seeds), part.log.policies, tuple(part.setups), tables, streams)
+    prices = part.log.price if any(setup.budget is not None for setup in part.setups) else None
+    return _Material(part.log.contexts, tuple(part.seeds), part.log.policies, tuple(part.setups), tables, streams, prices)
 
 
 def _collected(
@@ -161,6 +168,7 @@ def replay_one(
     seed: int,
     warm_start: WarmStart | None = None,
     factory: SelectorFactory | None = None,
+    within: Within | None = None,
     **settings: Any,
 ) -> NDArray[np.int16]:
     """Show one stream to one selector, which sees the reward of its choices only.
@@ -169,10 +177,11 @@ def replay_one(
         contexts: (T, D). rewards: (T, P).
         warm_start: shown first, in an order of the seed's.
         factory: makes the selector; None: the registry does.
+        within: a budget to keep to.
         settings: of the selector.
 
     Returns:
-        columns chosen, (T,).
+        columns chosen, (T,); -1 from where a budget pays for nothing.
     """
     from osel_sim.selection.registry import make_selector
 
@@ -181,6 +190,8 @@ def replay_one(
     with threads_where_imported(1):  # by now a selector that needs torch has imported it; the others do without, as that takes seconds
         if warm_start is not None:
             show(selector, warm_start, policies, seed)
+        if within is not None:
+            return within.play(selector, contexts, rewards, seed)
         return _played(selector, contexts, rewards, policies)
 
 
@@ -212,9 +223,7 @@ def _run(
     if workers == 1:
         ready()
         for job in jobs:
-            # The last bits of numpy's matrix products depend on the number of threads. Not around all jobs: what is made of a part in between is not
-            # part of it.
-            with threadpool_limits(1):
+            with one_thread():  # not around all of them: what is made of a part in between is not part of it
                 result = _replay_job(materials, factories, job)
             yield result
         return
@@ -225,10 +234,15 @@ def _run(
             yield event.value
 
 
-def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
-    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
+def one_thread_worker() -> None:
+    """Compute on one thread in this worker from now on."""
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
     threadpool_limits(1)
+
+
+def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
+    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
+    one_thread_worker()
     return lambda job, _: [_replay_job(materials, factories, job)]
 
 
@@ -241,4 +255,14 @@ def _replay_job(materials: Sequence[_Material], factories: Mapping[str, Selector
     contexts.flags.writeable = False
     kind, shown = name.removesuffix(WARM), setup.warm_start if name.endswith(WARM) else None
     seed, factory = material.seeds[number], factories.get(name)
-    return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, **setup.settings.get(name, {}))
+    within = None
+    if setup.budget is not None and material.prices is not None:
+        within = Within(setup.budget, streams.rewards(material.prices, number))
+    return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, within, **setup.settings.get(name, {}))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
+    with threadpool_limits(1), threads_where_imported(1):
+        yield

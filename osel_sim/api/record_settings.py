@@ -1,7 +1,7 @@
 """The settings of a recording."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Le
 
@@ -9,6 +9,7 @@ from osel_sim.api.settings import INSTANCES, MAIN, ContentSettings, Count, Folde
 
 STOPPING = Group("Stopping early", 0.5)
 HANDOFFS = Group("Handing over within an episode", 0.4)
+CLUSTER = Group("On several machines", 0.7)
 
 
 @settings
@@ -47,3 +48,15 @@ class RecordConfig(InstanceSettings, ContentSettings):
     """with --moments: cut an episode so many times at most (default: until it is over)"""
     start_seed: Annotated[Index, INSTANCES] = 0
     """seed of the first instance"""
+    shard: Annotated[str | None, CLUSTER] = None
+    """NUMBER/ALL, such as 3/40: record the third of forty parts only; osel_sim.merge puts them together"""
+    cluster: Annotated[Literal["slurm", "ray", "local"] | None, CLUSTER] = None
+    """record the parts elsewhere, and put them together: on a Slurm or Ray cluster, or as processes of this machine"""
+    shards: Annotated[Count | None, CLUSTER] = None
+    """with --cluster: number of parts"""
+    retries: Annotated[Index, CLUSTER] = 2
+    """with --cluster: how often a part that failed is sent again"""
+    at_once: Annotated[Count | None, CLUSTER] = None
+    """with --cluster: at most so many parts at a time (default: as many as the cluster takes, and as this machine has cores for)"""
+    cluster_option: Annotated[Names, CLUSTER] = ()
+    """with --cluster: KEY=VALUE for each part, as submitit (slurm_partition=gpu) or Ray (num_gpus=0.5) has it; repeatable"""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from osel_sim.analysis.frontier import FrontierPlan
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.analysis.sharing import Robots
     from osel_sim.analysis.targets import Target
     from osel_sim.interface.selector import SelectorFactory
     from osel_sim.selection.reward import RewardWeights
@@ -27,6 +28,8 @@ logger = logging.getLogger(__name__)
 
 SOONEST = ("auto", "linucb")
 """Selectors that are replayed first: they take seconds where PPO takes minutes, and the verdict hardly ever changes with the others."""
+WARM_SOON = 15_000
+"""Up to so many decisions, those of all seeds, `auto:warm` is replayed with them; beyond it the first verdict takes more than 20 s on two cores."""
 
 
 def replay(
@@ -68,6 +71,8 @@ def replay(
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
     if has_moments(config.log):
+        if config.robots > 1:
+            raise SettingError("robots", f"{config.log} is a table of moments, of which monitors learn; leave the flag out")
         return replay_moments(config)
     if config.monitors:
         raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
@@ -89,6 +94,7 @@ class _Replay:
         from osel_sim.analysis.live import is_live_run, read_live
         from osel_sim.analysis.log import read_log
         from osel_sim.analysis.logged_choices import choices_of, has_choices
+        from osel_sim.api.replay_budgets import check_budget
         from osel_sim.api.replay_changes import check_all_outcomes
         from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
 
@@ -99,6 +105,7 @@ class _Replay:
             if name not in selectors or name == "random":
                 raise UnknownNameError("selector", name, set(selectors) - {"random"}, "--route-with names selectors that are replayed")
         check_replay_folder(folder, config.overwrite)
+        self._robots(selectors)  # refuses what cannot be, before anything is read
         if not is_live_run(config.log):
             log = read_log(config.log, None if config.encoder == AUTO else config.encoder)
             weights, preset = weights_of(config, log.metadata)
@@ -115,8 +122,11 @@ class _Replay:
             weights, preset = weights_of(config, recorded=live.reward)
         found = self._off_policy(live, weights)
         check_all_outcomes(config, live.has_all_outcomes(weights))
+        check_budget(config, live.has_all_outcomes(weights))
         if live.has_all_outcomes(weights):
             return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
+        if config.robots > 1:
+            raise UsageError(f"--robots {config.robots} needs the outcomes of every policy, and {config.log} has only those of what was chosen")
         write_off_policy(folder, found)
         return self._tell(ReplayResult(folder, off_policy=found), config.log, True)
 
@@ -133,11 +143,14 @@ class _Replay:
         from osel_sim.analysis.engine import Part, replay_parts
         from osel_sim.analysis.oracles import oracles
         from osel_sim.analysis.result import Question, build, tables, with_fixed
+        from osel_sim.api.replay_budgets import check_budget, plan_budgets_of
         from osel_sim.api.replay_changes import changes_asked, replay_changes
+        from osel_sim.api.robots import replay_robots
         from osel_sim.core.progress import progress
-        from osel_sim.formats.replay_result import FRONTIER, PENDING, write_replay
+        from osel_sim.formats.replay_result import BUDGET, FRONTIER, PENDING, SHARING, write_replay
 
-        config, seeds = self.config, range(self.config.seeds)
+        config, seeds, robots = self.config, range(self.config.seeds), self._robots(selectors)
+        check_budget(config, True)
         if config.context:
             log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)
@@ -148,8 +161,9 @@ class _Replay:
             )
         here, question = setup(weights), Question(config.margin, config.half is not None, config.route_with)
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
-        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors)]
-        parts = [*stages, *([] if plan is None else [plan.part])]
+        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors, len(seeds) * (config.decisions or len(log)))]
+        budgets = plan_budgets_of(config, log, here, selectors)
+        parts = [*stages, *([] if budgets is None else [budgets.part]), *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
         with (
             progress(sum(part.total for part in parts), "decision", scale=True) as bar,
@@ -162,6 +176,8 @@ class _Replay:
             for part, made in zip(parts, replayed, strict=True):
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
+                elif budgets is not None and part is budgets.part:
+                    result[BUDGET] = budgets.measured(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}
@@ -173,12 +189,29 @@ class _Replay:
                     result["off_policy"] = off_policy
                     result |= _told(here)
                 pending = [name for name in selectors if name not in chosen]
+                pending += [BUDGET] if budgets is not None and BUDGET not in result else []
                 pending += [FRONTIER] if plan is not None and part is not plan.part else []
+                pending += [SHARING] if robots is not None else []
                 whole = {**result, PENDING: pending} if pending else result
                 with bar.aside():
                     write_replay(config.folder, whole, choices, tables(result))
                     done = self._tell(ReplayResult(config.folder, whole, off_policy), config.folder, part is parts[0])
-        return done
+        if robots is None:
+            return done
+        named, asked = robots
+        result[SHARING] = replay_robots(log, here, named, asked, config, self.factories)
+        write_replay(config.folder, result, choices, tables(result))
+        return self._tell(ReplayResult(config.folder, result, off_policy), config.folder, False)
+
+    def _robots(self, selectors: Sequence[str]) -> "tuple[list[str], Robots] | None":
+        """Selectors of the robots, and what they share; None where there is one robot."""
+        from osel_sim.api.replay_changes import changes_asked
+        from osel_sim.api.robots import robots_asked
+
+        asked = robots_asked(self.config, selectors, named=self.config.selectors is not None, own=self.factories)
+        if asked is not None and changes_asked(self.config):
+            raise UsageError("--robots is for streams that do not change: leave out --join, --leave and --drift, or --robots")
+        return asked
 
     def _tell(self, result: ReplayResult, page_of: Path, first: bool) -> ReplayResult:
         if self.on_result is not None:
@@ -257,9 +290,14 @@ class _Replay:
         return evaluate(live, weights, own)
 
 
-def _stages(selectors: Sequence[str]) -> list[list[str]]:
-    """Those that a verdict comes of soonest, and all others; where there is nothing to tell apart, all in one."""
-    first = [name for name in selectors if name in SOONEST]
+def _stages(selectors: Sequence[str], decisions: int) -> list[list[str]]:
+    """Those that a verdict comes of soonest, and all others; where there is nothing to tell apart, all in one.
+
+    Args:
+        decisions: of each selector, in all seeds.
+    """
+    soonest = (*SOONEST, "auto:warm") if decisions <= WARM_SOON else SOONEST
+    first = [name for name in selectors if name in soonest]
     return [names for names in (first, [name for name in selectors if name not in first]) if names] or [[]]
 
 

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
+from osel_sim.api.robot_settings import RobotSettings
 from osel_sim.api.settings import MAIN, OTHER, Count, Files, Folder, LoggedRewardSettings, Names, NonNegative, settings
 from osel_sim.core.errors import UnknownNameError, UsageError
 
 
 @settings
-class ReplayConfig(LoggedRewardSettings):
+class ReplayConfig(RobotSettings, LoggedRewardSettings):
     """Replay a rollout log to selectors: how far from the oracle is each, and is routing worth it?"""
 
     log: Folder
@@ -44,6 +45,10 @@ class ReplayConfig(LoggedRewardSettings):
     """a gain in reward a decision that is not worth routing for"""
     route_with: Annotated[Names | None, OTHER] = None
     """selectors that the verdict may advise (default: auto, with --half auto:warm too)"""
+    budget_cents: Annotated[NonNegative | None, OTHER] = None
+    """replay within budgets, too: this one in cents, and quarters to four times of it, against the best that could be had for as much"""
+    budget_per: Annotated[Count | None, OTHER] = None
+    """with --budget-cents: a budget for each so many decisions, one after the other (default: one for the whole stream)"""
     join: Annotated[Names, OTHER] = ()
     """POLICY@DECISION: a policy that is not there before that decision of a stream; what selectors make of it is reported"""
     leave: Annotated[Names, OTHER] = ()

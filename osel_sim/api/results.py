@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 if TYPE_CHECKING:
     import pandas
 
+    from osel_sim.formats.budget import Spent
     from osel_sim.formats.journal import Decision
     from osel_sim.formats.rollout_log import Row
     from osel_sim.reporting.charts import Figure
@@ -33,6 +34,7 @@ class RunResult:
         page: the page about it, or None where it could not be written.
         interrupted: Ctrl-C ended it; `run(..., resume=True)` goes on.
         verdict: whether routing is worth it on its instances, as the page says it; empty without a page.
+        spent: what came of its budget; None of a run without one.
     """
 
     folder: Path
@@ -41,6 +43,7 @@ class RunResult:
     page: Path | None = None
     interrupted: bool = False
     verdict: str = ""
+    spent: "Spent | None" = None
 
     @cached_property
     def decisions(self) -> "pandas.DataFrame":

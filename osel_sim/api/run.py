@@ -2,13 +2,13 @@
 
 import contextlib
 import logging
-import signal
-import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from osel_sim.api.interruption import Interrupt
 from osel_sim.api.results import RunResult
 from osel_sim.api.run_settings import RunConfig
 from osel_sim.core.errors import UnknownNameError
@@ -16,6 +16,7 @@ from osel_sim.core.trust import trusting
 
 if TYPE_CHECKING:
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.episodes.budget_file import BudgetFile
     from osel_sim.episodes.changes import PolicyChanges
     from osel_sim.episodes.live import LiveRun
     from osel_sim.episodes.run_subscribers import RunSubscriber
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from osel_sim.interface.suite import Task
     from osel_sim.policy.objects import PolicyObject
     from osel_sim.reporting.live_page import LivePage
+    from osel_sim.selection.budget import Budgeted
     from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | SelectorFactory
@@ -101,6 +103,8 @@ class _Run:
         monitor: "MonitorFactory | None" = None,
     ) -> None:
         from osel_sim.api.reward import weights_of
+        from osel_sim.api.robots import check_robots
+        from osel_sim.api.run_budget import budget_of
         from osel_sim.api.run_changes import plan
         from osel_sim.api.run_monitor import check_monitor
         from osel_sim.api.run_resume import policies_then
@@ -122,12 +126,16 @@ class _Run:
         self.driving = with_fallbacks(self.plan.driving, config.policies_dir) if self.plan.changes else self.everyone
         self.weights = weights_of(config)[0]
         self._check_selector()
+        self.budget = budget_of(config, self.tasks, [*self.policies, *self.plan.joined.values()])
+        self.sharing = check_robots(config, self.tasks, named=self.factory is None)
         check_monitor(config, monitor, self.policies)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
         self.axes_above = sorted({instance.axes for instance in drawn if instance.axes})
         self.page = self._page()
+        self.spending: Budgeted | None = None
+        self.spent: BudgetFile | None = None
         self.grown_from: int | None = None  # decisions that a resumed run was to have, where those are fewer
 
     def execute(self) -> RunResult:
@@ -187,8 +195,8 @@ class _Run:
             self._write_changes(folder)
             if self.grown_from is not None:
                 note_growth(folder, config.episodes)
-            with _Interrupt() as interrupt:
-                live.run(config.episodes, lambda: interrupt.asked)
+            with Interrupt() as interrupt:
+                live.run(config.episodes, lambda: interrupt.asked or (self.spending is not None and not self.spending.affordable))
             interrupted = interrupt.asked and len(live.decisions) < config.episodes
         return self._finish(live, interrupted)
 
@@ -211,6 +219,8 @@ class _Run:
 
     def _configuration(self) -> dict[str, Any]:
         """Everything the journal depends on but the encoder, content of files included."""
+        from osel_sim.api.robots import fleet_said
+        from osel_sim.api.run_budget import said
         from osel_sim.api.run_monitor import monitor_said
         from osel_sim.core.files import digest
         from osel_sim.formats.rollout_log import ROLLOUTS
@@ -232,24 +242,38 @@ class _Run:
             "reward": asdict(self.weights),
             "counterfactual": config.counterfactual,
             **({"context": config.context} if config.context else {}),
+            **said(self.budget),
+            **fleet_said(config, self.sharing),
             **monitor_said(config),
             "content": {**content_digests(self.tasks, self.everyone), **warm},
         }
 
     def _selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
+        """The selector, kept within the budget where there is one."""
+        from osel_sim.context.appended import LENGTH
+        from osel_sim.selection.budget import Budgeted
+
+        selector = self._free_selector(encoder, configuration)
+        if self.budget is None:
+            return selector
+        self.spending = Budgeted(selector, self.budget, encoder.dimension + (LENGTH if self.config.context else 0), self.config.seed)
+        return self.spending
+
+    def _free_selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
+        from osel_sim.api.robots import in_turn
         from osel_sim.context.appended import LENGTH
         from osel_sim.selection.registry import make_selector, wanted_of
 
         names = [spec.name for spec in self.policies]
         parts = (encoder.dimension, LENGTH) if self.config.context else (encoder.dimension,)
         if self.factory is not None:
-            return self.factory(names, sum(parts), self.config.seed)
+            return in_turn(self.config, self.sharing, partial(self.factory, names, sum(parts)))
         known = _declared(self.config, self.tasks, self.policies, self.weights, encoder)
         if "skills" in known:
             configuration["skills"] = known["skills"].digest if known["skills"] is not None else None
         if len(parts) > 1:
             known |= wanted_of(self.config.selector, {"parts": parts})
-        return make_selector(self.config.selector, names, sum(parts), self.config.seed, **known)
+        return in_turn(self.config, self.sharing, partial(make_selector, self.config.selector, names, sum(parts), **known))
 
     def _changes(self, encoder: "Encoder", selector: "Selector") -> "PolicyChanges":
         """The changes of the run, with what the selector is told of policies when they join."""
@@ -290,21 +314,28 @@ class _Run:
         options = LiveOptions(
             *(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context),
             changes=self._changes(encoder, selector),
+            prices={spec.name: spec.price for spec in (*self.policies, *self.plan.joined.values())},
         )
+        options = replace(options, robots=config.robots, robots_by=config.robots_by)
         monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
         return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder), monitor)
 
     def _subscribers(self, folder: Path) -> "list[RunSubscriber]":
         """What watches the run."""
+        from osel_sim.episodes.budget_file import BudgetFile
         from osel_sim.episodes.progress import Progress
         from osel_sim.episodes.run_subscribers import Films, Paced, TimingFile
         from osel_sim.episodes.tensorboard import TensorBoard
+        from osel_sim.episodes.warnings import WarningFile
         from osel_sim.reporting.view import View
 
         config = self.config
         films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
-        return [TimingFile(), *films, *wanted, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
+        if self.spending is not None:
+            self.spent = BudgetFile(self.spending, "subgoals" if self.weights.success == "subgoals" else "success", config.episodes)
+        spent = [self.spent] if self.spent is not None else []
+        return [TimingFile(), WarningFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
 
     def _page(self) -> "LivePage | None":
         """Writes the page, if one is wanted."""
@@ -318,12 +349,14 @@ class _Run:
         """Show the selector the outcomes of a rollout log, except those of instances that this run decides on."""
         from osel_sim.analysis.warm_start import WarmStart, show
         from osel_sim.api.run_resume import check_still_unseen
+        from osel_sim.selection.fleet import members
 
         own = live.instance_keys(self.config.episodes)
         if self.grown_from is not None:
             check_still_unseen(own - live.instance_keys(self.grown_from), log.keys, log.source, self.config.episodes)
         log = log.take([row for row, key in enumerate(log.keys) if key not in own])
-        count = show(live.selector, WarmStart(log.contexts, log.rewards(self.weights)), live.selector.policies, self.config.seed)
+        for selector in members(live.selector):
+            count = show(selector, WarmStart(log.contexts, log.rewards(self.weights)), selector.policies, self.config.seed)
         logger.info("shown beforehand: %d outcomes of %d instances of %s, none of them of this run", count, len(log), log.source)
 
     def _finish(self, live: "LiveRun", interrupted: bool) -> RunResult:
@@ -334,32 +367,8 @@ class _Run:
         if self.page is not None and self.page.problem is not None:
             logger.warning("no report.html: %s", self.page.problem)
         page, verdict = (self.page.file, self.page.verdict) if self.page else (None, "")
-        return RunResult(live.folder, summary, tuple(live.decisions), page, interrupted, verdict)
-
-
-class _Interrupt:
-    """Within, the first Ctrl-C asks to stop after the decision at hand; the second one raises KeyboardInterrupt.
-
-    Signals only reach the main thread; in another one nothing is changed.
-    """
-
-    def __init__(self) -> None:
-        self.asked = False
-        self._before: Any = None
-
-    def __enter__(self) -> "_Interrupt":
-        if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._ask)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, self._before)
-
-    def _ask(self, *_: object) -> None:
-        self.asked = True
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        logger.info("\nfinishing this decision; Ctrl-C again leaves at once")
+        spent = self.spent.spent if self.spent is not None else None
+        return RunResult(live.folder, summary, tuple(live.decisions), page, interrupted, verdict, spent)
 
 
 def title(tasks: "Sequence[Task]") -> str:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+from osel_sim.api.robot_settings import RobotSettings
 from osel_sim.api.settings import (
     MAIN,
     OTHER,
@@ -13,6 +14,7 @@ from osel_sim.api.settings import (
     Index,
     InstanceSettings,
     Names,
+    NonNegative,
     RewardSettings,
     settings,
 )
@@ -22,7 +24,7 @@ FILMED_EVERY = 5
 
 
 @settings
-class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
+class RunConfig(RobotSettings, RewardSettings, InstanceSettings, ContentSettings):
     """Let a selector choose, live in simulation, which policy handles each instance, and learn from the reward."""
 
     task: Annotated[Names, MAIN] = ()
@@ -59,6 +61,10 @@ class RunConfig(RewardSettings, InstanceSettings, ContentSettings):
     """also write TensorBoard event files (needs the package tensorboard)"""
     realtime: Annotated[bool, OTHER] = False
     """sleep so that the robot moves in real time"""
+    budget_cents: Annotated[NonNegative | None, MAIN] = None
+    """never spend more cents than that: the selector spends them where they help most, and free policies take over when they are spent"""
+    budget_per: Annotated[Count | None, OTHER] = None
+    """with --budget-cents: a budget for each so many decisions, one after the other (default: one for the whole run)"""
     warm_start: Annotated[Folder | None, OTHER] = None
     """rollout log whose outcomes the selector is shown first (auto, linucb, thompson ...)"""
     monitor: Annotated[str | None, OTHER] = None

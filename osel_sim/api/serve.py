@@ -10,7 +10,7 @@ import threading
 from collections.abc import Iterator
 from typing import IO, TYPE_CHECKING, Annotated
 
-from osel_sim.api.settings import CONTENT, MAIN, OTHER, Folder, TrustSettings, settings
+from osel_sim.api.settings import CONTENT, MAIN, OTHER, Count, Folder, NonNegative, TrustSettings, settings
 from osel_sim.core.errors import SettingError, UsageError
 from osel_sim.core.trust import trusting
 from osel_sim.remote.address import check_address
@@ -19,8 +19,13 @@ from osel_sim.remote.serving import run_until_signal, stop_with_stdin
 
 if TYPE_CHECKING:
     from osel_sim.interface.environment import EnvironmentSpec
+    from osel_sim.policy.registry import MakeSession
+    from osel_sim.remote.batching import Batching
 
 logger = logging.getLogger(__name__)
+
+BATCH_MAX = 32
+"""Clients that are answered together at most, where nothing else is said."""
 
 
 @settings
@@ -33,6 +38,10 @@ class ServeConfig(TrustSettings):
     """address to listen on; the default is reached from this machine only"""
     port: Annotated[int, MAIN] = 8000
     """port, 0 for a free one"""
+    batch_ms: Annotated[NonNegative | None, MAIN] = None
+    """answer several clients together, each waiting for others for so many milliseconds at most (default: one after another)"""
+    batch_max: Annotated[Count | None, MAIN] = None
+    """with --batch-ms: at most so many together (default: 32)"""
     token_env: Annotated[str, MAIN] = TOKEN_VARIABLE
     """environment variable with the token"""
     policies_dir: Annotated[Folder | None, CONTENT] = None
@@ -78,6 +87,8 @@ def _ready_line(descriptor: int | None) -> Iterator[IO[str]]:
 def _serve(config: ServeConfig, out: IO[str]) -> None:
     if not 0 <= config.port <= 65535:
         raise SettingError("port", f"must lie in [0, 65535], got {config.port}")
+    if config.batch_max is not None and config.batch_ms is None:
+        raise SettingError("batch_max", "says how many are answered together: add --batch-ms, or leave it out")
     from osel_sim.formats import library
 
     spec = library.load_policy(config.policy, config.policies_dir)
@@ -98,7 +109,7 @@ def _serve(config: ServeConfig, out: IO[str]) -> None:
     greeting = Greeting.of(spec, environment)
     make_session = session_factory(spec, environment)
     warm_up(make_session, greeting)
-    server = PolicyServer(make_session, greeting, token, config.host, config.port)
+    server = PolicyServer(make_session, greeting, token, config.host, config.port, _batching(config, make_session, greeting))
 
     def ready(port: int) -> None:
         host = f"[{config.host}]" if ":" in config.host else config.host
@@ -106,6 +117,20 @@ def _serve(config: ServeConfig, out: IO[str]) -> None:
         print(json.dumps(line if given is not None else {**line, "token": token}), file=out, flush=True)
 
     run_until_signal(server, ready)
+
+
+def _batching(config: ServeConfig, make_session: "MakeSession", greeting: Greeting) -> "Batching | None":
+    """How requests are answered together, where that was asked for and the policy can."""
+    from osel_sim.policy.batched import why_not_together
+    from osel_sim.remote.batching import Batching
+    from osel_sim.remote.protocol import differing_observations
+
+    if config.batch_ms is None:
+        return None
+    if why := why_not_together(make_session, differing_observations(greeting, 3), greeting.action_dim):
+        logger.warning("%s answers its clients one after another: %s", greeting.policy, why)
+        return None
+    return Batching(config.batch_ms / 1e3, config.batch_max or BATCH_MAX)
 
 
 def _environment(config: ServeConfig) -> "EnvironmentSpec":

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 USAGE = 2
 INTERRUPTED = 130
 BROKEN_PIPE = 141
-ADDING = ("--axis", "--camera", "--trust")
+ADDING = ("--axis", "--camera", "--cluster-option", "--trust")
 """Flags that may be repeated, each time with more."""
 
 Switch = tuple[Any, str, Callable[[Mapping[str, Any]], int] | None]

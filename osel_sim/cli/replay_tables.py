@@ -5,6 +5,7 @@ from typing import Any
 
 from rich.console import Console
 
+from osel_sim.cli.budget_table import print_budget
 from osel_sim.cli.console import MOST_POLICIES, Table, number, percent, plain
 
 
@@ -59,6 +60,7 @@ def print_replay(console: Console, result: Mapping[str, Any]) -> None:
         notes.append(f"{log['left_out']['instances']} instances without an outcome of every policy were left out.")
     if choice := log.get("encoder_choice"):
         notes.append(choice["text"])
+    print_budget(console, result.get("budget"))
     for note in notes:
         console.print(plain(note))
     console.print(plain(result["verdict"]["text"], "bold"), soft_wrap=True)

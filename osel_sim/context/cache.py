@@ -2,7 +2,7 @@
 
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -51,6 +51,10 @@ class ContextCache:
     def encoders(self) -> list[str]:
         """Identities of the encoders that have contexts here."""
         return sorted(self._contexts)
+
+    def items(self, encoder: str) -> Iterator[tuple[str, Context]]:
+        """Key and context of everything that an encoder, given by its identity, has here; examples of skills among it."""
+        return iter(self._contexts.get(encoder, {}).items())
 
     def get(self, encoder: str, instance: str) -> Context | None:
         """The context (d,) of an instance, or None. `encoder` is an identity, or a name where only one identity here has it."""

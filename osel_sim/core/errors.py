@@ -82,6 +82,12 @@ class DivergedError(OselError):
     exit_code = 1
 
 
+class BudgetError(OselError):
+    """What is left of a budget pays for no policy any more, and none is free."""
+
+    exit_code = 4
+
+
 class WorkerError(OselError):
     """Worker processes keep dying, so the work cannot go on. The message names how the last one ended."""
 

@@ -45,6 +45,20 @@ def held(folder: Path) -> Iterator[None]:
         yield
 
 
+def is_held(folder: Path) -> bool:
+    """Whether another process holds a folder now."""
+    if not (folder / LOCK).exists():
+        return False
+    try:
+        with (folder / LOCK).open("a", encoding="utf-8") as handle:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass  # no lock to be had here, or it has gone meanwhile
+    return False
+
+
 @contextlib.contextmanager
 def taken(folder: Path, results: Sequence[str]) -> Iterator[None]:
     """Make a folder, and hold it within the block. If the block raises before there is anything in one of `results`, the folder is as it was.

@@ -7,6 +7,7 @@ from typing import Any
 from osel_sim.formats.policy_changes import PolicyChange
 from osel_sim.interface.selector import Selector
 from osel_sim.selection.base import SelectorBase
+from osel_sim.selection.budget import Budgeted
 from osel_sim.selection.changing import changing
 
 
@@ -41,6 +42,7 @@ def apply(selector: Selector, change: PolicyChange, told: Mapping[str, Any]) -> 
     if change.event == "retire":
         able.retire_policy(change.policy)
         return
-    if told and isinstance(selector, SelectorBase):
-        selector.tell(told)
+    within = selector.inner if isinstance(selector, Budgeted) else selector
+    if told and isinstance(within, SelectorBase):
+        within.tell(told)
     able.add_policy(change.policy)

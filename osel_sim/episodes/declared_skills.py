@@ -9,6 +9,7 @@ from osel_sim.core import content
 from osel_sim.core.errors import ContentError, DataError, UsageError
 from osel_sim.core.files import read_json
 from osel_sim.core.torch_settings import threads
+from osel_sim.formats.merged_policy import MERGE, parts_of
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.suite import Task
@@ -23,6 +24,8 @@ EXAMPLES = 8
 def declared_skills(spec: PolicySpec, tasks: Path | None = None) -> tuple[str, ...] | None:
     """Names of the tasks that a policy was made for; None if nobody says.
 
+    A merge was made for what any of its parts was made for, where all of them say.
+
     Said by `skills` in its file, else by the `training.json` that osel_sim.train leaves beside a checkpoint: the tasks of its demonstrations, as far
     as there are files of them.
 
@@ -32,6 +35,9 @@ def declared_skills(spec: PolicySpec, tasks: Path | None = None) -> tuple[str, .
     Raises:
         ContentError: the file names a task that there is not.
     """
+    if spec.kind == MERGE:
+        known_of = [declared_skills(part, tasks) for part in parts_of(spec)]
+        return None if None in known_of else tuple(dict.fromkeys(name for names in known_of for name in names or ()))
     if spec.skills is not None:
         try:
             return tuple(task.name for task in select_tasks(spec.skills, tasks))

@@ -21,6 +21,8 @@ class Tally:
 
     Attributes:
         began: control steps of the episode when it took over.
+        paid: cents beyond the price in its file (`osel_sim.interface.call.Call.paid`).
+        paid_per_action: the same for an action of the chunk at hand.
     """
 
     spec: PolicySpec
@@ -28,11 +30,18 @@ class Tally:
     calls: int = 0
     actions: int = 0
     megabytes: float = 0.0
+    paid: float = 0.0
+    paid_per_action: float = 0.0
 
     @property
     def price(self) -> float:
         """Cents."""
-        return self.spec.price.of(self.actions, self.calls, self.megabytes)
+        return self.spec.price.of(self.actions, self.calls, self.megabytes) + self.paid
+
+    def made(self, actions: int) -> None:
+        """Count actions of its chunk that were executed."""
+        self.actions += actions
+        self.paid += actions * self.paid_per_action
 
 
 def episode_seed(instance_key: str, policy: str, repeat: int) -> tuple[int, ...]:

@@ -9,7 +9,9 @@ from typing import Self
 from osel_sim.core import content
 from osel_sim.core.errors import ContentError, OselError, UsageError
 from osel_sim.episodes.loop import Driver
+from osel_sim.episodes.merged_caller import MergedCaller
 from osel_sim.formats import library
+from osel_sim.formats.merged_policy import MergedSpec, is_merge, merged, parts_of
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.policy.environment_fit import check_environment, misfits
@@ -48,7 +50,11 @@ def choose_policies(
         if wanted.count(name) > 1:
             raise UsageError(f"policy {name!r} is named twice after --policies")
     at_hand = objects or {}
-    found = [at_hand[name].spec_for(environment) if name in at_hand else library.load_policy(name, folder) for name in wanted]
+
+    def load(name: str) -> PolicySpec:
+        return at_hand[name].spec_for(environment) if name in at_hand else library.load_policy(name, folder)
+
+    found = [merged(name, load) if is_merge(name) else load(name) for name in wanted]
     for spec in found:
         check_environment(spec, environment)
     return found
@@ -70,13 +76,14 @@ def left_out(environment: EnvironmentSpec, folder: Path | None = None) -> dict[s
 
 
 def with_fallbacks(specs: Sequence[PolicySpec], folder: Path | None = None) -> list[PolicySpec]:
-    """The policies and those that they fall back to.
+    """The policies, those that they are made of, and those that they fall back to.
 
     Raises:
         ContentError: a fallback does not exist or is not local.
     """
     found = {spec.name: spec for spec in specs}
-    for spec in specs:
+    found |= {part.name: part for spec in specs for part in parts_of(spec) if part.name not in found}
+    for spec in list(found.values()):
         name = spec.remote.fallback if spec.remote else None
         if name is None:
             continue
@@ -112,6 +119,8 @@ class Drivers:
 
         for spec in specs:
             check_environment(spec, environment)
+        merges = [spec for spec in specs if isinstance(spec, MergedSpec)]
+        specs = [spec for spec in specs if not isinstance(spec, MergedSpec)]
         remote = [spec for spec in specs if spec.is_remote]
         self._drivers: dict[str, Driver] = {}
         # Servers load their weights in their own processes meanwhile.
@@ -135,6 +144,13 @@ class Drivers:
         if problem is not None:
             self.close()
             raise problem
+        self._merged = [MergedCaller(spec, [self._drivers[part.name] for part in spec.parts], environment.action) for spec in merges]
+        self._drivers |= {spec.name: Driver(spec, caller) for spec, caller in zip(merges, self._merged, strict=True)}
+
+    def trust(self, propensities: Mapping[str, float]) -> None:
+        """Let merges follow, where their parts disagree, the one that a selector would rather have chosen (`MergedCaller.trust`)."""
+        for caller in self._merged:
+            caller.trust(propensities)
 
     def __enter__(self) -> Self:
         return self

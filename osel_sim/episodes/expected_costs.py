@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 
 from osel_sim.core.errors import UsageError
+from osel_sim.formats.merged_policy import parts_of
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.remote.network import NetworkModel, profile
@@ -35,10 +36,10 @@ def expected_costs(policies: Sequence[PolicySpec], weights: RewardWeights, actio
 
 def _cost(spec: PolicySpec, weights: RewardWeights, actions: int, environment: EnvironmentSpec) -> float:
     calls = math.ceil(actions / spec.execute)
-    waiting, megabytes = _call(spec, environment)
-    steps = actions + calls * waiting
+    parts = [(part, *_call(part, environment)) for part in parts_of(spec)]  # of a merge all are asked and paid, and the slowest is waited for
+    steps = actions + calls * max(waiting for _, waiting, _ in parts)
     time = counted_time(weights, steps, steps / environment.control_hz)
-    return float(charge(weights, time, spec.price.of(actions, calls, calls * megabytes)))
+    return float(charge(weights, time, sum(part.price.of(actions, calls, calls * megabytes) for part, _, megabytes in parts)))
 
 
 def _call(spec: PolicySpec, environment: EnvironmentSpec) -> tuple[float, float]:

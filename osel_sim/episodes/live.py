@@ -18,6 +18,7 @@ from osel_sim.episodes.loop import run_episode
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
 from osel_sim.episodes.view import view
+from osel_sim.episodes.warnings import Watch
 from osel_sim.episodes.watching import RunMonitor
 from osel_sim.formats.counterfactual import COUNTERFACTUAL, Others, to_others
 from osel_sim.formats.journal import (
@@ -34,12 +35,15 @@ from osel_sim.formats.journal import (
     to_decision,
 )
 from osel_sim.formats.points import POINTS
+from osel_sim.formats.policy_file import Price
+from osel_sim.formats.run_warnings import RunWarning
 from osel_sim.formats.summary import check_summary
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.outcome import Outcome
-from osel_sim.interface.selector import Choice, Selector
+from osel_sim.interface.selector import Choice, Pays, Selector
 from osel_sim.interface.suite import Task
+from osel_sim.selection.dealing import By, robots_share
 from osel_sim.selection.reward import RewardWeights, check_reward, reward
 from osel_sim.suites.open_tasks import OpenTasks
 
@@ -55,7 +59,10 @@ class LiveOptions:
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
         context: `task` appends the task's name to the contexts that the selector is shown.
+        robots: how many take turns, decision by decision.
+        robots_by: what their instances differ in (`osel_sim.selection.dealing`); None: nothing.
         changes: policies that join and leave.
+        prices: what policies cost by their files, for warnings.
     """
 
     seed: int
@@ -66,7 +73,10 @@ class LiveOptions:
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
     context: str | None = None
+    robots: int = 1
+    robots_by: By | None = None
     changes: PolicyChanges = field(default_factory=PolicyChanges)
+    prices: Mapping[str, Price] = field(default_factory=dict)
 
 
 class LiveRun:
@@ -81,6 +91,7 @@ class LiveRun:
 
     Attributes:
         decisions: all so far.
+        warnings: all so far (`osel_sim.episodes.warnings`).
         rewards: of every policy (columns) in every decision (rows), NaN where there is none; only chosen ones without `counterfactual`.
         alone: with `counterfactual` and a monitor, what each chosen policy comes to without it; None after an error.
 
@@ -114,6 +125,8 @@ class LiveRun:
             monitor.open(folder, len(self.decisions))
         self._journal = Lines(folder / JOURNAL)
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
+        self.warnings: list[RunWarning] = []
+        self._watch = Watch(options.prices, [(task.name, level) for task in tasks for level in options.levels])
         self._ever = tuple(selector.policies)
         self._rows: list[dict[str, float | None]] = []
         self.alone: list[float | None] = []
@@ -167,7 +180,8 @@ class LiveRun:
                     f"{self._journal.file}, line {decision.index + 1}: says {decision.policy!r} was chosen, this selector now chooses "
                     f"{choice.policy!r} with {choice.propensities}: the run was made with other versions or on another machine"
                 )
-            self._learn(context, choice, decision.reward)
+            self._learn(context, choice, decision)
+            self.warnings += self._watch.see(decision)
             if self.monitor is not None:
                 self.monitor.replay(decision)
             known = {decision.policy: decision.reward}
@@ -189,6 +203,7 @@ class LiveRun:
         choice = self.selector.select(context)
         for subscriber in self.subscribers:
             subscriber.on_choice(index, choice.policy)
+        self.drivers.trust(choice.propensities)
         outcome = self._episode(index, instance, start, choice.policy, chosen=True)
         decision = self._decision(index, instance, choice, outcome, start.scene if self._tells_scenes else None)
         # What a suite or a selector of others got wrong is told now, not when the journal is read.
@@ -213,9 +228,13 @@ class LiveRun:
         self._journal.append(decision.to_dict())
         self.decisions.append(decision)
         self._rows.append(rewards)
-        self._learn(context, choice, decision.reward)
+        self._learn(context, choice, decision)
         if self.monitor is not None:
             self.monitor.learn(decision)
+        for warning in self._watch.see(decision):
+            self.warnings.append(warning)
+            for subscriber in self.subscribers:
+                subscriber.on_warning(warning)
         if self._change(index + 1):
             self._tell_changes(index + 1)
         return decision
@@ -254,8 +273,9 @@ class LiveRun:
     def _instance(self, index: int) -> Instance:
         options = self.options
         chance = np.random.default_rng([options.seed, index])
-        task = self.tasks[int(chance.integers(len(self.tasks)))]
-        level = options.levels[int(chance.integers(len(options.levels)))]
+        tasks, levels = robots_share(self.tasks, options.levels, index % options.robots, options.robots, options.robots_by)
+        task = tasks[int(chance.integers(len(tasks)))]
+        level = levels[int(chance.integers(len(levels)))]
         return task.instance(options.seed * SEEDS_PER_RUN + index, level, options.split, options.axes)
 
     def _check(self, decision: Decision, instance: Instance) -> None:
@@ -289,9 +309,11 @@ class LiveRun:
     def _reward(self, outcome: Outcome) -> float | None:
         return None if outcome.error is not None else reward(outcome, self.options.weights)
 
-    def _learn(self, context: NDArray[np.float32], choice: Choice, value: float | None) -> None:
-        if value is not None:  # an error teaches nothing
-            self.selector.update(context, choice, value)
+    def _learn(self, context: NDArray[np.float32], choice: Choice, decision: Decision) -> None:
+        if isinstance(self.selector, Pays):
+            self.selector.pay(decision.policy, decision.price)
+        if decision.reward is not None:  # an error teaches nothing
+            self.selector.update(context, choice, decision.reward)
 
     def _change(self, index: int) -> bool:
         """Let policies join and leave before a decision. Returns whether any does."""

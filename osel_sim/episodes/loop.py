@@ -216,6 +216,7 @@ class Episode:
             (call, made), answer = answer, None
             if call.actions is None:
                 return call.failure
+            self.tallies[-1].paid_per_action = call.paid_per_action  # only now: what was made while waiting is of the answer before
             stop = max(made, driver.spec.execute)
             self._make(call.actions[made:stop])
             self.rest, self.planner = call.actions[stop:], len(self.tallies) - 1
@@ -281,6 +282,7 @@ class Episode:
         """Count a call, and let the time pass that it took. Returns how many actions of the old chunk were made meanwhile."""
         tally.calls += call.sent
         tally.megabytes += call.megabytes
+        tally.paid += call.paid
         self.upload += call.upload
         self.inference += call.inference
         self.download += call.download
@@ -300,14 +302,14 @@ class Episode:
         unseen = len(actions) - (self.history.length - 1)
         if self.chunked is not None and unseen > 1 and not self.env.done:
             made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions[:unseen]]))
-            self.tallies[planner].actions += made
+            self.tallies[planner].made(made)
             return made if made < unseen or unseen == len(actions) else made + self._make(actions[unseen:], planner)
         for made, action in enumerate(actions):
             if self.env.done:
                 return made
             self._remember(len(actions) - made)
             self.env.advance(self.noise(action))
-            self.tallies[planner].actions += 1
+            self.tallies[planner].made(1)
             self._stepped(waiting=False)
         return len(actions)
 

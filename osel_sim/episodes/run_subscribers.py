@@ -13,6 +13,7 @@ from osel_sim.episodes.subscribers import RealTime, Timing
 from osel_sim.episodes.video import Video
 from osel_sim.formats.journal import TIMING, Decision, Lines
 from osel_sim.formats.policy_changes import PolicyChange
+from osel_sim.formats.run_warnings import RunWarning
 
 VIDEOS = "videos"
 
@@ -39,6 +40,11 @@ class Run(Protocol):
     @property
     def rewards(self) -> NDArray[np.float64]:
         """(decisions, policies) reward of every policy in every decision, NaN where there is none."""
+        ...
+
+    @property
+    def warnings(self) -> Sequence[RunWarning]:
+        """All warnings so far, also those of the run's earlier processes."""
         ...
 
 
@@ -81,6 +87,9 @@ class RunSubscriber:
         Args:
             checksums: file -> that of its line (`osel_sim.formats.journal.line_digest`).
         """
+
+    def on_warning(self, warning: RunWarning) -> None:
+        """Something changed that nobody announced, such as a policy that succeeds less than it did. The decision that showed it is in the journal."""
 
     def on_end(self, run: Run) -> None:
         """The run is over or interrupted, and all of its files are written. Not told after an error."""

@@ -14,7 +14,7 @@ class Start:
     def __init__(self, env: Environment, instance: Instance) -> None:
         env.load(instance)
         self._env, self._instance = env, instance
-        self.scene = env.scene_digest() if isinstance(env, TellsScene) else None
+        self.scene = (env.scene_digest() or None) if isinstance(env, TellsScene) else None
         self._snapshot = env.snapshot() if env.specification.snapshots else None
 
     def again(self) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from osel_sim.core.errors import WorkerError
 from osel_sim.core.processes import Result, Work, run_jobs
 from osel_sim.episodes.moments import Cuts, MomentRunner, Moments
+from osel_sim.episodes.shard import Shard
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.interface.instance import Instance
@@ -48,6 +49,7 @@ class Plan:
         axes: axis -> level, where it differs from the instance's level.
         action_noise: as `run_episode` takes it.
         cuts: where episodes are cut, to let other policies go on from there; None: nowhere.
+        shard: which of the instances are meant; None for all.
     """
 
     tasks: tuple[Task, ...]
@@ -62,18 +64,34 @@ class Plan:
     axes: Mapping[str, int] = field(default_factory=dict)
     action_noise: float = 0.0
     cuts: Cuts | None = None
+    shard: Shard | None = None
 
     @functools.cached_property
     def instances(self) -> dict[str, Instance]:
         """Key -> instance, in the order of rows: task by task, seed by seed."""
-        drawn = (task.instance(seed, self.levels[seed % len(self.levels)], self.split, self.axes) for task in self.tasks for seed in self.seeds)
+        wanted = [(task, seed) for task in self.tasks for seed in self.seeds]
+        drawn = (self._instance(task, seed) for task, seed in (wanted if self.shard is None else self.shard.part(wanted)))
         return {instance.key: instance for instance in drawn}
+
+    @property
+    def perturbed(self) -> list[str]:
+        """Axes perturbed beyond an instance's level, as its `axes` says them; of a shard those of the whole: they depend on task and level alone."""
+        one_of_each = (self._instance(task, seed) for task in self.tasks for seed in self.seeds[: len(self.levels)])
+        return sorted({instance.axes for instance in [*self.instances.values(), *one_of_each] if instance.axes})
+
+    def _instance(self, task: Task, seed: int) -> Instance:
+        return task.instance(seed, self.levels[seed % len(self.levels)], self.split, self.axes)
 
     def episodes(self, instance: str) -> list[Episode]:
         """Those of the instance of this key, in the order of rows."""
-        turn = self.instances[instance].seed // len(self.levels)  # of all levels once: counting seeds would repeat some levels and never others
-        repeats = self.repeats if turn % self.repeat_every == 0 else 1
+        repeats = repeats_of(self.instances[instance].seed, len(self.levels), self.repeats, self.repeat_every)
         return [(spec.name, repeat) for spec in self.policies for repeat in range(repeats)]
+
+
+def repeats_of(seed: int, levels: int, repeats: int, repeat_every: int) -> int:
+    """Episodes of each policy on the instances of a seed; the rest as `Plan` has it, with the number of its levels."""
+    turn = seed // levels  # of all levels once: counting seeds would repeat some levels and never others
+    return repeats if turn % repeat_every == 0 else 1
 
 
 @dataclass

@@ -9,7 +9,7 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -25,7 +25,7 @@ from osel_sim.interface.suite import Task
 
 SCHEMA_VERSION = 1
 RUN = "run.json"
-UNSAID = ("robot", "context", "until_decided", "monitor", "moments")
+UNSAID = ("robot", "context", "until_decided", "monitor", "moments", "budget", "fleet", "shard")
 """Keys of a configuration that are left out where they say what is usual; they are compared all the same."""
 LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
 
@@ -201,12 +201,16 @@ def note_growth(folder: Path, episodes: int) -> None:
 
 
 def _compare(file: Path, old: dict[str, Any], new: dict[str, Any]) -> None:
+    for key, was, now in differences(old, new):
+        raise UsageError(f"{file}: {key} was {was!r} at the beginning, now it is {now!r}; resume with the same, or give another --out")
+
+
+def differences(old: dict[str, Any], new: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Each key, nested ones joined with dots, whose value differs, with both values; None where there is none."""
     was, now = _flat(old), _flat(new)
     for key in [*now, *(key for key in was if key not in now)]:
         if was.get(key) != now.get(key):
-            raise UsageError(
-                f"{file}: {key} was {was.get(key)!r} at the beginning, now it is {now.get(key)!r}; resume with the same, or give another --out"
-            )
+            yield key, was.get(key), now.get(key)
 
 
 def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:

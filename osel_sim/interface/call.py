@@ -18,6 +18,8 @@ class Call:
         measured_seconds: what the call really took here; for `timing.jsonl` only.
         failure: why there are no actions (`deadline`, `outage`, or a sentence), or None.
         sent: the policy was asked. False where it could not be reached: that costs time, but is no call and has no price.
+        paid, paid_per_action: cents for this call, and for every action of it that is executed, beyond the price in the policy's file: of a merge,
+            whose parts have prices of their own.
     """
 
     actions: Actions | None
@@ -28,6 +30,8 @@ class Call:
     measured_seconds: float = 0.0
     failure: str | None = None
     sent: bool = True
+    paid: float = 0.0
+    paid_per_action: float = 0.0
 
     def __post_init__(self) -> None:
         if (self.actions is None) == (self.failure is None):

@@ -247,6 +247,7 @@ class TellsScene(Protocol):
     def scene_digest(self) -> str:
         """Digest of the scene of the loaded instance with its instruction: another one where anything is that an episode depends on.
 
+        Empty where it cannot be told after all.
         It should not depend on last bits, as of a simulation before the first step, which differ from machine to machine.
         """
         ...

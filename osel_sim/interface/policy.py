@@ -1,6 +1,7 @@
 """What drives the robot: the two-method contract."""
 
-from typing import Any, Protocol
+from collections.abc import Sequence
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,4 +29,20 @@ class Policy(Protocol):
 
     def act(self, observation: Observation) -> Actions:
         """The next chunk of actions, (T, D) float32."""
+        ...
+
+
+@runtime_checkable
+class Batched(Policy, Protocol):
+    """A policy whose sessions, which share their weights, can be asked together: a server may do so where several robots ask at once.
+
+    Optional: sessions of a policy without it are asked one after another.
+    """
+
+    @classmethod
+    def act_batch(cls, sessions: Sequence[Self], observations: Sequence[Observation]) -> Sequence[Actions]:
+        """The next chunk of each session, as its `act` would give it for its observation (to 1e-5; a server tries that before it serves).
+
+        If it raises, no session may have changed: each is then asked alone.
+        """
         ...

@@ -42,7 +42,10 @@ class Choice:
 class Selector(Protocol):
     """Chooses among `policies`. `select` and `update` alternate, or lag behind each other where episodes run at once."""
 
-    policies: tuple[str, ...]
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Names of those that are available now."""
+        ...
 
     def select(self, context: Context) -> Choice:
         """Choose a policy for an instance."""
@@ -62,6 +65,52 @@ class Selector(Protocol):
 
     def add_policy(self, name: str) -> None:
         """Make one more policy available; what was learned of the others stays."""
+        ...
+
+
+@runtime_checkable
+class Pays(Protocol):
+    """A selector that wants to know what its choices cost, such as one that keeps to a budget."""
+
+    def pay(self, policy: str, price: float) -> None:
+        """Told once after each choice, before `update`, and where an error leaves nothing to learn too.
+
+        Args:
+            price: cents.
+        """
+        ...
+
+
+@runtime_checkable
+class Shares(Protocol):
+    """A selector that learns together with others of its kind, policies and settings, on other robots: they exchange what they learned, never images.
+
+    Messages are numpy arrays and values that JSON can hold, by name, like a `State`. What one holds, and how many bytes, the selector's own docstring
+    says.
+    """
+
+    def begin(self, first: State | None) -> State:
+        """Begin to share, before the first decision; what was learned until now, such as in a warm start, all have in common and none tells.
+
+        Args:
+            first: what this returned on the first robot, for all to begin alike; None on the first one itself.
+
+        Returns:
+            what the others need to begin like this one; empty where all do so anyway.
+        """
+        ...
+
+    def share(self) -> State:
+        """What it learned from its own decisions since the last call, or since `begin`. It forgets nothing by that."""
+        ...
+
+    def absorb(self, messages: Sequence[State], own: int) -> None:
+        """Take in what all robots shared at the same time.
+
+        Args:
+            messages: one of each robot, in their order.
+            own: which of them is this selector's: it knows that one already, and may have decided and learned since.
+        """
         ...
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 
 from osel_sim.core.errors import ContentError, did_you_mean
+from osel_sim.formats.merged_policy import MERGE, parts_of
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.policy.mapping import has_scale, known_parts
@@ -14,6 +15,8 @@ def check_environment(spec: PolicySpec, environment: EnvironmentSpec) -> None:
     Raises:
         ContentError: naming the file, the key, what the environment has and what the policy wants.
     """
+    for part in parts_of(spec) if spec.kind == MERGE else ():
+        check_environment(part, environment)
     for key, problem in misfits(spec, environment):
         raise ContentError(spec.file, key, problem)
 

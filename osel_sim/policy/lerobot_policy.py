@@ -5,7 +5,7 @@ import copy
 import io
 import logging
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from osel_sim.policy.fit import camera_keys, check_fit, check_normalisation, che
 from osel_sim.policy.history import split
 from osel_sim.policy.mapping import actions_of, image_of, state_of
 from osel_sim.policy.perception_step import PerceptionStep
+from osel_sim.policy.row_random import drawing_by_row
 from osel_sim.policy.text import embed
 from osel_sim.policy.trust import check_checkpoint
 
@@ -107,6 +108,29 @@ class LeRobotPolicy:
             chunk = self._policy.predict_action_chunk(prepared[0])[0] if len(prepared) == 1 else self._planned(prepared)
             actions = self._after(chunk)
         self._calls += 1
+        return self._finished(actions)
+
+    @classmethod
+    def act_batch(cls, sessions: Sequence["LeRobotPolicy"], observations: Sequence[Observation]) -> list[Actions]:
+        """The next chunk of each session, with its own random numbers, in one pass of the network for all that are shown things of one shape."""
+        shown = [split(observation) for observation in observations]
+        if any(len(steps) > 1 for steps in shown):  # LeRobot plans from such in queues of one session
+            return [session.act(observation) for session, observation in zip(sessions, observations, strict=True)]
+        chunks: dict[int, Tensor] = {}
+        with torch.inference_mode(), threads(1), no_foreign_code():
+            prepared = [session._prepared(steps[0]) for session, steps in zip(sessions, shown, strict=True)]
+            for rows in _of_one_shape(prepared):
+                seeds = [_seed(sessions[row]._instruction, sessions[row]._calls) for row in rows]
+                with drawing_by_row(seeds):
+                    together = {key: torch.cat([prepared[row][key] for row in rows]) for key in prepared[rows[0]]}
+                    chunks |= zip(rows, sessions[rows[0]]._policy.predict_action_chunk(together), strict=True)
+            actions = [session._finished(session._after(chunks[row])) for row, session in enumerate(sessions)]
+        for session in sessions:
+            session._calls += 1
+        return actions
+
+    def _finished(self, actions: Tensor) -> Actions:
+        """Postprocessed actions (T, D) as the environment takes them."""
         action = self._environment.action
         return action.clip(actions_of(actions.float().cpu().numpy(), self._mapping, action))
 
@@ -228,5 +252,19 @@ def quiet() -> Iterator[None]:
 def drawing(instruction: str, call: int) -> Iterator[None]:
     """With torch's random numbers those of an instruction and call, for policies that start from noise; put back afterwards."""
     with torch.random.fork_rng(devices=[torch.cuda.current_device()] if torch.cuda.is_available() else []):
-        torch.manual_seed(zlib.crc32(instruction.encode()) + call)
+        torch.manual_seed(_seed(instruction, call))
         yield
+
+
+def _seed(instruction: str, call: int) -> int:
+    return zlib.crc32(instruction.encode()) + call
+
+
+def _of_one_shape(prepared: Sequence[dict[str, Tensor]]) -> list[list[int]]:
+    """Which observations go through the network together: those with the same tensors, but for their first dimension, which must be 1."""
+    groups: dict[Any, list[int]] = {}
+    for row, tensors in enumerate(prepared):
+        alike = tuple((key, tensor.dtype, tuple(tensor.shape)) for key, tensor in tensors.items())
+        alone = any(tensor.ndim == 0 or tensor.shape[0] != 1 for tensor in tensors.values())
+        groups.setdefault((alike, row if alone else None), []).append(row)
+    return list(groups.values())

@@ -11,6 +11,7 @@ from typing import Any
 
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.core.registry import Registry
+from osel_sim.formats.merged_policy import MERGE
 from osel_sim.formats.policy_file import PRIVILEGED, SERVERS, PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
 from osel_sim.interface.policy import Policy
@@ -66,6 +67,8 @@ def make_policy(spec: PolicySpec, environment: EnvironmentSpec) -> Policy:
 def _loader(spec: PolicySpec) -> Loader:
     if spec.kind in SERVERS:
         raise UsageError(f"{spec.file}: kind: {spec.kind!r} is a server of its own and cannot be loaded here; give its address as url in [remote]")
+    if spec.kind == MERGE:
+        raise UsageError(f"policy {spec.name!r} is asked in an episode only: load or serve its policies one by one")
     if spec.is_privileged:
         raise UsageError(f"{spec.file}: kind: {spec.kind!r} sees the simulator's state and only drives in an episode: it cannot be served")
     if spec.kind not in LOADERS:

@@ -166,6 +166,20 @@ def example_observation(greeting: Greeting) -> Observation:
     return {**images, **state, TASK: "pick up the can"}
 
 
+def differing_observations(greeting: Greeting, count: int) -> list[Observation]:
+    """Noise in the right form, each with another instruction: to try whether what is answered together is what is answered alone."""
+    random, found = np.random.default_rng(0), list[Observation]()
+    for number in range(count):
+        example = example_observation(greeting)
+        for key, value in example.items():
+            if key.startswith(IMAGES):
+                example[key] = random.integers(0, 256, value.shape, np.uint8)
+            elif key == STATE:
+                example[key] = random.normal(0.0, 0.3, value.shape).astype(np.float32)
+        found.append({**example, TASK: f"pick up the can and put it into bowl {number}"})
+    return found
+
+
 def largest_observation(greeting: Greeting) -> int:
     """Bytes of the largest message a client may send, with room for a longer one to be answered instead of cut off."""
     return 2 * greeting.history * len(greeting.cameras) * 3 * greeting.image_size**2 + (1 << 20)

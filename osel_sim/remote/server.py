@@ -4,75 +4,28 @@ import asyncio
 import contextlib
 import hmac
 import logging
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from http import HTTPStatus
 from typing import Any, TypeVar
 
-import numpy as np
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from osel_sim.core.errors import OselError, PolicyError
-from osel_sim.interface.policy import Policy
-from osel_sim.policy.local import check_form
 from osel_sim.policy.registry import MakeSession
 from osel_sim.remote.address import cannot_listen
-from osel_sim.remote.codec import ProtocolError, pack, unpack
-from osel_sim.remote.libero_client import is_libero, read_libero
-from osel_sim.remote.protocol import (
-    HEALTH,
-    RESET,
-    TASK,
-    Greeting,
-    ObservationError,
-    check_instruction,
-    check_observation,
-    check_token,
-    example_observation,
-    largest_observation,
-)
+from osel_sim.remote.batching import Batches, Batching
+from osel_sim.remote.codec import ProtocolError, pack
+from osel_sim.remote.protocol import HEALTH, Greeting, ObservationError, check_token, example_observation, largest_observation
+from osel_sim.remote.session import Session
 
 log = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 CLOSE_SECONDS = 3.0
 INTERNAL_ERROR = 1011  # WebSocket close code, as openpi's server sends it
-
-
-class Session:
-    """One client's policy. Not safe for threads; the server runs one inference at a time."""
-
-    def __init__(self, policy: Policy, greeting: Greeting) -> None:
-        self._policy, self._greeting = policy, greeting
-        self._instruction: str | None = None
-
-    def answer(self, frame: bytes) -> bytes:
-        """The reply to one frame: actions, or the same map back for a reset.
-
-        Raises:
-            ProtocolError, ObservationError: the client's fault, the session goes on.
-            Exception: the policy's fault.
-        """
-        message = unpack(frame)
-        if isinstance(message, dict) and RESET in message:
-            if len(message) != 1:
-                raise ProtocolError(f"a reset has the one key {RESET!r}")
-            self._reset(check_instruction(message[RESET]))
-            return pack(message)
-        observation = check_observation(read_libero(message, self._greeting) if is_libero(message) else message, self._greeting)
-        if observation[TASK] != self._instruction:
-            self._reset(observation[TASK])
-        start = time.perf_counter()
-        actions = check_form(self._policy.act(observation), self._greeting.action_dim)
-        actions = actions.astype(np.float32) if self._greeting.action is None else self._greeting.action.clip(actions)
-        return pack({"actions": actions, "server_timing": {"infer_ms": 1e3 * (time.perf_counter() - start)}})
-
-    def _reset(self, instruction: str) -> None:
-        self._policy.reset(instruction)
-        self._instruction = instruction
 
 
 class PolicyServer:
@@ -85,15 +38,20 @@ class PolicyServer:
         greeting: what is served.
         token: what clients must bring as `Authorization: Api-Key ...`.
         host, port: where to listen; port 0 takes a free one.
+        batching: how requests of several clients are answered together; None: one after another.
 
     Raises:
         UsageError: the token is not fit for a header.
     """
 
-    def __init__(self, make_session: MakeSession, greeting: Greeting, token: str, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(
+        self, make_session: MakeSession, greeting: Greeting, token: str, host: str = "127.0.0.1", port: int = 0, batching: Batching | None = None
+    ) -> None:
         self._make_session, self._greeting, self._host, self._port = make_session, greeting, host, port
         self._authorization = f"Api-Key {check_token(token)}".encode()
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="inference")
+        self._clients = 0
+        self._batches = None if batching is None else Batches(batching, self._in_thread, lambda: self._clients)
 
     async def run(self, stop: asyncio.Event, ready: Callable[[int], None]) -> None:
         """Serve until `stop` is set. `ready` is told the port.
@@ -135,6 +93,7 @@ class PolicyServer:
     async def _handle(self, connection: ServerConnection) -> None:
         with contextlib.suppress(ConnectionClosed):
             try:
+                self._clients += 1
                 session = Session(await self._in_thread(self._make_session), self._greeting)
                 await connection.send(pack(self._greeting.to_dict()))
                 async for frame in connection:
@@ -146,13 +105,16 @@ class PolicyServer:
                 reason = f"PolicyError: {error}" if isinstance(error, PolicyError) else "InternalError: the policy failed; its server's log says why"
                 await connection.send(reason)
                 await connection.close(INTERNAL_ERROR, "the policy failed")
+            finally:
+                self._clients -= 1
 
     async def _reply(self, connection: ServerConnection, session: Session, frame: str | bytes) -> None:
         """Answer one message; what is wrong with it is told in a text message, as openpi does, and the session goes on."""
         try:
             if isinstance(frame, str):
                 raise ProtocolError("expected a binary msgpack frame, got text")
-            reply: str | bytes = await self._in_thread(session.answer, frame)
+            asked = self._in_thread(session.answer, frame) if self._batches is None else self._batches.answer(session, frame)
+            reply: str | bytes = await asked
         except (ProtocolError, ObservationError) as error:
             log.warning("refused a message of %s: %s", connection.remote_address, error)
             reply = f"{type(error).__name__}: {error}"

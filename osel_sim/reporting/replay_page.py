@@ -19,6 +19,7 @@ from osel_sim.context.appended import TASK_NAME
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.formats.replay_result import CHANGES, PENDING, REPLAY, Choices, read_replay
 from osel_sim.formats.rollout_log import read_rollouts
+from osel_sim.reporting.budget_section import replay_budget
 from osel_sim.reporting.changing_page import changing_page, reward_figure
 from osel_sim.reporting.charts import Figure, Look
 from osel_sim.reporting.cluster_sections import Replayed
@@ -39,6 +40,7 @@ from osel_sim.reporting.selector_sections import (
     regret_figure,
     share_figure,
 )
+from osel_sim.reporting.sharing_section import sharing_sections
 from osel_sim.reporting.verdict_tiles import TONES, gain_tiles
 from osel_sim.selection.reward import RewardWeights
 
@@ -160,7 +162,7 @@ def _page(replay: _Replay, scenes: Scenes) -> Page:
     title += f" so far; still being replayed: {few(result[PENDING])}" if result.get(PENDING) else ""
     who = _speaker(result)
     routes = route_figure(log, weights, _chosen(choices, who, names) if who in names else None)
-    sections = [Section("selectors", "Selectors", selectors), *shared]
+    sections = [Section("selectors", "Selectors", selectors), *replay_budget(result.get("budget")), *sharing_sections(result), *shared]
     facts, episodes = _facts(replay.folder, result, log, weights), _episodes(log, weights, choices, names, look, scenes(log))
     return Page("Replay", title, _verdict(result), sections, facts, episodes, routes)
 

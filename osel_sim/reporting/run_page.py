@@ -19,6 +19,7 @@ from osel_sim.analysis.verdict_words import in_units
 from osel_sim.core.errors import DataError
 from osel_sim.formats.journal import Decision
 from osel_sim.formats.run_config import read_run
+from osel_sim.reporting.budget_section import run_budget
 from osel_sim.reporting.changes_section import changes_table
 from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, thinned
@@ -32,6 +33,7 @@ from osel_sim.reporting.palette import colours
 from osel_sim.reporting.routes import Chosen, route_figure
 from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, look_of, penalty_figure, regret_figure
 from osel_sim.reporting.verdict_tiles import shown_verdict
+from osel_sim.reporting.warnings_section import warnings_section
 from osel_sim.selection.registry import RECOMMENDATION, is_recommended
 from osel_sim.selection.reward import FLOOR_SECONDS, RewardWeights
 from osel_sim.statistics.betting import advantage_bounds
@@ -66,7 +68,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     blocks += [_propensities(run), _chosen_table(run, selector), *([changes_table(run.live, run.weights)] if run.live.changes else [])]
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
-    sections = [Section("curves", "Learning", blocks)]
+    sections = [*warnings_section(folder), Section("curves", "Learning", blocks), *run_budget(folder, run.decisions)]
     try:
         sections += log_sections(run.log, run.weights)[0]
     except DataError as error:  # a run without counterfactual knows too little for some tables

@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,6 +31,8 @@ class SelectorBase(ABC):
     name: ClassVar[str]
     off_policy: ClassVar[bool] = False
     """Whether it may learn from outcomes of choices that it did not make itself, such as those of a log."""
+    charges: Mapping[str, float] = MappingProxyType({})
+    """What the choice of each policy is charged for, in reward, beyond what is learned: nothing unless a budget says so (`selection.budget`)."""
 
     retires: ClassVar[bool] = False
     """Whether it heeds `columns`, so that policies may retire."""
@@ -77,6 +80,16 @@ class SelectorBase(ABC):
         if not math.isfinite(reward):
             raise UsageError(f"a reward must be finite, got {reward}; an episode that ended in error has none")
         self._update(context, choice, float(reward))
+
+    def expected(self, context: Context) -> NDArray[np.float64] | None:
+        """Expected reward of each policy for a context, (P,), up to a constant that all have; None of a selector that has none, and heeds no charges.
+
+        Raises:
+            UsageError: wrong shape or type, or not finite.
+        """
+        self._check_context(context)
+        found = self._expected(context)
+        return None if found is None else found[self.columns]
 
     def state_dict(self) -> State:
         """The whole state, as `Selector.state_dict` promises. Arrays are copies."""
@@ -152,6 +165,15 @@ class SelectorBase(ABC):
 
     @abstractmethod
     def _update(self, context: Context, choice: Choice, reward: float) -> None: ...
+
+    def _expected(self, context: Context) -> NDArray[np.float64] | None:
+        """The same of all known policies, in their order; overridden by selectors that subtract `_charged` from what they compare."""
+        return None
+
+    @property
+    def _charged(self) -> NDArray[np.float64]:
+        """The charges of all known policies, in their order."""
+        return np.array([self.charges.get(name, 0.0) for name in self.known])
 
     @abstractmethod
     def _state(self) -> State: ...

@@ -12,8 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from osel_sim.core.errors import UnknownNameError, UsageError
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
+from osel_sim.selection.change_point import PIECES, change_point
 from osel_sim.selection.features import Array, Features, Part, Sketch, warm_table
-from osel_sim.selection.regression import NOISE_WEIGHT, Moments, SharedRegression, fit
+from osel_sim.selection.regression import Moments, SharedRegression, fit
+from osel_sim.selection.shared_rows import SharedRows, part_of
 from osel_sim.selection.skills import DECLARED, NOT_DECLARED, UNKNOWN, Skills
 from osel_sim.statistics.best import probability_of_best
 
@@ -33,8 +35,8 @@ NOTHING = 1e-6
 GROWTH = 1.25
 """Features and evidence are computed afresh whenever there are this many times as many decisions."""
 
-PIECES = 16
-"""A change is looked for at the ends of so many equal pieces of what was seen."""
+LOOK = 32
+"""Between fits a change is looked for whenever so many decisions more were made, or about a thirtieth of all where that is more."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Prior:
         optimism, chance: weights of two ways to explore what a policy's success in this context is, >= 0.
         mean_optimism, mean_chance: the same for what its success is in any context.
         floor: the probability with which the n-th choice is made at random is floor / sqrt(n), half at most; in [0, 1].
+        least: it is never below that, so that a policy that nobody chooses any more is seen to become better; in [0, 1].
         alarm: what was seen before a change is forgotten once rewards are so many times as probable with it as without; > 1, infinite for never.
         expected_costs: policy -> what of its reward is known beforehand, alpha_time * time + alpha_price * price, so that only success must be
             learned (`episodes.expected_costs` computes them from policy files). May name policies to be added later. None: learned with the rest.
@@ -65,6 +68,7 @@ class Prior:
     mean_optimism: float = 0.0
     mean_chance: float = 0.0
     floor: float = 0.0
+    least: float = 0.0
     alarm: float = math.inf
     expected_costs: Mapping[str, float] | None = None
     warm_contexts: ArrayLike | None = None
@@ -78,8 +82,9 @@ class Prior:
                 raise UsageError(f"{name} must be finite and >= 0, got {value}")
         if not self.alarm > 1.0:
             raise UsageError(f"alarm must be greater than 1, got {self.alarm}")
-        if not 0.0 <= self.floor <= 1.0:
-            raise UsageError(f"floor must lie in [0, 1], got {self.floor}")
+        for name in ("floor", "least"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise UsageError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
         if not self.signals or not all(math.isfinite(signal) and signal > 0.0 for signal in self.signals):
             raise UsageError(f"signals must be one or more finite numbers > 0, got {list(self.signals)}")
         if self.parts and (len(self.parts) != 2 or min(self.parts) < 1):
@@ -94,10 +99,11 @@ class Prior:
         parts = {"parts": list(self.parts)} if self.parts else {}
         alarm = {"alarm": float(self.alarm)} if math.isfinite(self.alarm) else {}
         weights = {name: float(getattr(self, name)) for name in ("optimism", "chance", "mean_optimism", "mean_chance", "floor")}
-        return {**lists, **weights, **parts, **alarm}
+        least = {"least": float(self.least)} if self.least else {}
+        return {**lists, **weights, **parts, **alarm, **least}
 
 
-class BayesianSelector(SelectorBase):
+class BayesianSelector(SharedRows, SelectorBase):
     """Regresses reward plus declared cost on features of the context and chooses by mean, uncertainty and chance.
 
     Model: reward + cost = mean of all + mean of the policy + (shared + own of the policy) . features + noise, all Gaussian
@@ -114,8 +120,8 @@ class BayesianSelector(SelectorBase):
 
     Whenever the number of decisions has grown by a quarter, features are fitted afresh to the contexts seen so far, and the regression is computed
     again on them; in between it is updated decision by decision. Where a context has two parts, features of the first, of both and of the second are
-    fitted, and those of the highest evidence kept until the next time. Then, too, it is asked whether some policy has become better or worse; if the
-    evidence says so, the decisions before are forgotten (see `alarm` in `Prior`).
+    fitted, and those of the highest evidence kept until the next time. Then, and every `LOOK` decisions between, it is asked whether some policy has
+    become better or worse; if the evidence says so, the decisions before are forgotten (see `alarm` in `Prior`).
 
     Args:
         policies, context_dim, seed: see `SelectorBase`.
@@ -185,14 +191,20 @@ class BayesianSelector(SelectorBase):
         of_context = variances - of_mean
         unit = self._deviation * math.sqrt(self._regression.noise)
         hope = unit * (prior.mean_optimism * np.sqrt(of_mean) + prior.optimism * np.sqrt(of_context))
-        scores = self._deviation * (means + rows[:, : len(self._guess)] @ self._guess) - self._costs + hope
+        scores = self._deviation * (means + rows[:, : len(self._guess)] @ self._guess) - self._costs + hope - self._charged
         few = 1.0 + FEW * self._counts / (self._counts + 1.0) ** 2
         chance = prior.mean_chance**2 * few * of_mean + prior.chance**2 * of_context
         propensities = probability_of_best(scores[self.columns], (unit * np.sqrt(chance))[self.columns])
-        random = min(0.5, prior.floor / math.sqrt(len(self._chosen) + 1))
+        random = max(prior.least, min(0.5, prior.floor / math.sqrt(len(self._chosen) + 1)))
         propensities = (1.0 - random) * propensities + random / len(propensities)
         index = int(self._generator.choice(len(self.policies), p=propensities))
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
+
+    def _expected(self, context: Context) -> Array:
+        self._catch_up()
+        rows = self._rows(context)
+        means, _ = self._regression.predict(rows)
+        return np.asarray(self._deviation * (means + rows[:, : len(self._guess)] @ self._guess) - self._costs, np.float64)
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         sketched, heads = self._see(context)
@@ -202,6 +214,7 @@ class BayesianSelector(SelectorBase):
         self._chosen.append(index)
         self._counts[index] += 1
         self._targets.append(float(reward + self._costs[index]))
+        self._note()
 
     def _catch_up(self) -> None:
         """Learn from what came since the last choice. Of several fits that are due only the last is computed, as nothing is left of those before: a
@@ -215,7 +228,23 @@ class BayesianSelector(SelectorBase):
             row = np.concatenate([self._heads[at], self._transform(self._contexts[at])[0]])
             target = self._standard(self._targets[at]) - float(self._heads[at] @ self._guess)
             self._regression.update(self._chosen[at], row, target)
-        self._known = count
+        every = max(LOOK, 1 << (count // LOOK).bit_length() >> 1)  # a power of two of about a thirtieth of all
+        if count > self._known and count % every == 0:
+            self._look(count)
+        self._known = len(self._targets)
+
+    def _look(self, count: int) -> None:
+        """Forget what was before a change that showed itself since the last fit."""
+        if change := self._change(np.array(self._contexts, np.float64), np.array(self._chosen), self._standard(np.array(self._targets))):
+            self._forget(count, change)
+
+    def _forget(self, count: int, change: int) -> None:
+        """Forget the first `change` of `count` decisions, and fit what is left."""
+        for seen in (self._contexts, self._heads, self._chosen, self._targets):
+            del seen[:change]
+        self._counts = np.bincount(self._chosen, minlength=len(self._costs))
+        self._next_fit = max(count - change + 1, math.ceil((count - change) * GROWTH))
+        self._fit(count - change)
 
     def _fit(self, count: int) -> None:
         """Scale, features, evidence and regression from the first so many decisions; from the prior alone at first."""
@@ -231,39 +260,18 @@ class BayesianSelector(SelectorBase):
         self._view = int(np.argmax([evidence for evidence, _, _ in found]))
         _, self._signal, self._regression = found[self._view]
         if change := self._change(contexts, chosen, targets):
-            for seen in (self._contexts, self._heads, self._chosen, self._targets):
-                del seen[:change]
-            self._counts = np.bincount(self._chosen, minlength=len(self._costs))
-            self._next_fit = max(count - change + 1, math.ceil((count - change) * GROWTH))
-            self._fit(count - change)
+            self._forget(count, change)
             return
         self._known, self._transformed = count, None
 
     def _change(self, contexts: Array, chosen: NDArray[np.int64], targets: Array) -> int:
-        """How many of the decisions to forget: those before policies became better or worse than the contexts explain; 0 where nothing changed.
-
-        What the regression leaves unexplained has mean 0 for every policy, at all times, however choices changed while it was learned. Compared is
-        that with means of their own before and after a change (Gaussian, of prior variance 1 relative to the noise), wherever it was.
-        """
+        """How many of the decisions to forget: those before policies became better or worse than the contexts explain; 0 where nothing changed."""
         if not math.isfinite(self._prior.alarm) or len(chosen) < PIECES:
             return 0
-        starts = len(chosen) * np.arange(1, PIECES) // PIECES
         heads = np.array(self._heads[: len(targets)], np.float64)
         rows = np.concatenate([heads, self._features.transform(contexts)], axis=1)
         left = targets - heads @ self._guess - (rows * self._regression.weights[chosen]).sum(axis=1)
-        # A success rate near 1 varies less than others: a policy is measured by its own noise, where that is more than the others'.
-        noise, tried = self._regression.noise, np.bincount(chosen, minlength=len(self._counts))
-        own = (NOISE_WEIGHT * noise + np.bincount(chosen, left**2, len(self._counts))) / (NOISE_WEIGHT + tried)
-        left /= np.sqrt(np.maximum(own, noise))[chosen]
-        piece = np.searchsorted(starts, np.arange(len(chosen)), side="right")
-        counts, sums = np.zeros((2, PIECES, len(self._counts)))
-        np.add.at(counts, (piece, chosen), 1.0)
-        np.add.at(sums, (piece, chosen), left)
-        counts, sums = counts.cumsum(axis=0), sums.cumsum(axis=0)
-        before, after = _evidence(counts[:-1], sums[:-1]), _evidence(counts[-1] - counts[:-1], sums[-1] - sums[:-1])
-        ahead = before + after - _evidence(counts[-1:], sums[-1:])
-        most = float(ahead.max())
-        return int(starts[ahead.argmax()]) if most + math.log(np.exp(ahead - most).mean()) > math.log(self._prior.alarm) else 0
+        return change_point(left, chosen, len(self._counts), self._regression.noise, self._prior.alarm)
 
     def _regress(self, contexts: Array, chosen: NDArray[np.int64], targets: Array) -> tuple[float, float, SharedRegression]:
         """Evidence for the features that there are now, how much they matter by it, and the regression on them."""
@@ -368,6 +376,7 @@ class BayesianSelector(SelectorBase):
             **({"view": self._view} if self._prior.parts else {}),
             "model": [self._centre, self._deviation, self._signal, self._next_fit],
             "random": self._generator.bit_generator.state,
+            **self._fresh_state(),
             **{f"regression.{key}": value for key, value in self._regression.state().items()},
             **{f"features.{key}": value for key, value in self._features.state().items()},
         }
@@ -378,16 +387,8 @@ class BayesianSelector(SelectorBase):
         self._counts = np.bincount(state["chosen"], minlength=len(self._costs))
         self._centre, self._deviation, self._signal, self._next_fit = state["model"]
         self._generator.bit_generator.state = state["random"]
-        self._regression = SharedRegression(**{key: copy(value) for key, value in _part(state, "regression.").items()})
+        self._regression = SharedRegression(**{key: copy(value) for key, value in part_of(state, "regression.").items()})
         self._view = state.get("view", 0)
-        self._features.load(_part(state, "features."))
+        self._features.load(part_of(state, "features."))
         self._known, self._seen, self._transformed = len(self._targets), None, None
-
-
-def _evidence(counts: Array, sums: Array) -> Array:
-    """Log probability (n,) of numbers of variance 1 and means of prior variance 1, over that with means of 0, from counts and sums (n, P)."""
-    return np.asarray((0.5 * (sums**2 / (counts + 1.0) - np.log(counts + 1.0))).sum(axis=1), np.float64)
-
-
-def _part(state: State, prefix: str) -> State:
-    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+        self._load_fresh(state)

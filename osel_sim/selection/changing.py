@@ -3,6 +3,7 @@
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.selector import Changes, Selector
 from osel_sim.selection.base import SelectorBase
+from osel_sim.selection.budget import Budgeted
 
 
 def changing(selector: Selector, retires: bool) -> Changes:
@@ -14,6 +15,8 @@ def changing(selector: Selector, retires: bool) -> Changes:
     Raises:
         UsageError: it is none; names the methods that it lacks.
     """
+    if isinstance(selector, Budgeted):
+        changing(selector.inner, retires)
     name = getattr(selector, "name", type(selector).__name__)
     lacking = [method for method in ("add_policy", "retire_policy") if not callable(getattr(selector, method, None))]
     if lacking or not isinstance(selector, Changes):

@@ -24,6 +24,9 @@ class KernelUCBSelector(BayesianSelector):
     evidence says that a policy became better or worse, what was before is forgotten. Settings were chosen on made-up problems like those of
     `benchmarks/selection.py`, drawn from other seeds, and on the choosing half of `assets/logs/suite`.
 
+    Robots share their decisions: 4 * min(D, 256) + 24 bytes each for contexts of D numbers, 8 more with skills
+    (`osel_sim.selection.shared_rows.Rows`). Features, and how far each kind of them is believed, follow from those on every robot alike.
+
     Args:
         policies, context_dim, seed: see `SelectorBase`.
         expected_costs: policy -> declared alpha_time * time + alpha_price * price, as `episodes.expected_costs` gives; None learns them too.
@@ -31,7 +34,7 @@ class KernelUCBSelector(BayesianSelector):
         warm_contexts: (n, context_dim) contexts without outcomes to learn components and landmarks from; None starts cold.
         parts: lengths of the encoder's part of a context and of what is appended to it; which of them are used, the evidence says. Empty: one whole.
         components, whitening, width, landmarks: of the features, see `osel_sim.selection.features.Landmarks`.
-        signals, shared, optimism, mean_optimism, chance, mean_chance, floor, alarm: see `Prior`.
+        signals, shared, optimism, mean_optimism, chance, mean_chance, floor, least, alarm: see `Prior`.
 
     Raises:
         UsageError: a number out of range, or contexts (those of the skills, too) of another form.
@@ -61,6 +64,7 @@ class KernelUCBSelector(BayesianSelector):
         chance: float = 0.1,
         mean_chance: float = 0.4,
         floor: float = 0.1,
+        least: float = 0.0,
         alarm: float = 1e4,
     ) -> None:
         if components < 1 or landmarks < 1 or not width > 0.0:
@@ -74,6 +78,7 @@ class KernelUCBSelector(BayesianSelector):
             chance=chance,
             mean_chance=mean_chance,
             floor=floor,
+            least=least,
             alarm=alarm,
             expected_costs=expected_costs,
             warm_contexts=warm_contexts,

@@ -13,6 +13,8 @@ from osel_sim.selection.features import Components
 class LinearSelector(BayesianSelector):
     """Each policy's reward is linear in the whitened context; policies are learned one by one, as in the bandits' textbook form.
 
+    Robots share their decisions: 4 * min(D, 256) + 24 bytes each for contexts of D numbers (`osel_sim.selection.shared_rows.Rows`).
+
     Args:
         policies, context_dim, seed: see `SelectorBase`.
         components: principal components of the contexts seen, each whitened to the same variance.

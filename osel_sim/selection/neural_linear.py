@@ -21,6 +21,9 @@ class NeuralLinearSelector(BayesianSelector):
 
     It seldom stays with a worse policy (1 of 80 seeds of four problems without context, `benchmarks/selection.py`), as it chooses by chance.
 
+    Robots share their decisions, 4 * min(D, 256) + 24 bytes each for contexts of D numbers (`osel_sim.selection.shared_rows.Rows`), from which each
+    trains the same network and the same head; weights are not sent.
+
     The network is trained from scratch whenever the features are fitted, on all decisions so far; it sees the reward of the chosen policy only.
 
     Args:

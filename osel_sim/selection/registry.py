@@ -1,7 +1,7 @@
 """Selectors by name. Listing them imports none: torch and stable-baselines3 come in with the selector that needs them."""
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 from osel_sim.core.errors import UnknownNameError, UsageError
@@ -20,11 +20,13 @@ BUILT_IN = {
     "kernel_ucb": "osel_sim.selection.kernel_ucb:KernelUCBSelector",
     "lints": "osel_sim.selection.linear_bandits:LinTSSelector",
     "linucb": "osel_sim.selection.linear_bandits:LinUCBSelector",
+    "linucb_discounted": "osel_sim.selection.discounted:DiscountedLinUCBSelector",
     "neural_linear": "osel_sim.selection.neural_linear:NeuralLinearSelector",
     "ppo": "osel_sim.selection.ppo.sb3:PPOSelector",
     "ppo_tuned": "osel_sim.selection.ppo.tuned:TunedPPOSelector",
     "random": "osel_sim.selection.uniform:UniformSelector",
     "thompson": "osel_sim.selection.thompson:ThompsonSelector",
+    "thompson_window": "osel_sim.selection.thompson_window:WindowThompsonSelector",
     "ucb1": "osel_sim.selection.ucb1:UCB1Selector",
     "vw_regcb": "osel_sim.selection.vowpal:RegCBSelector",
     "vw_squarecb": "osel_sim.selection.vowpal:SquareCBSelector",
@@ -41,11 +43,13 @@ ABOUT = {
     "kernel_ucb": "another name of auto",
     "lints": "Thompson sampling on a linear model of the context",
     "linucb": "highest upper bound of a linear model of the context",
+    "linucb_discounted": "linucb that forgets at an even pace, for policies that change",
     "neural_linear": "Thompson sampling on the hidden layer of a small network",
     "ppo": "the paper's, of stable-baselines3: contextual, and slow to learn; the default of run",
     "ppo_tuned": "ppo with leading components of the context and a larger learning rate",
     "random": "every policy equally often",
     "thompson": "Thompson sampling on mean rewards, without context",
+    "thompson_window": "thompson on the last decisions alone, for policies that change",
     "ucb1": "highest upper bound of the mean rewards, without context",
     "vw_regcb": "Vowpal Wabbit's RegCB (extra vw)",
     "vw_squarecb": "Vowpal Wabbit's SquareCB (extra vw)",
@@ -121,6 +125,27 @@ def learns_off_policy(name: str) -> bool:
         UnknownNameError: no such selector.
     """
     return bool(getattr(_load(name), "off_policy", False))
+
+
+def can_share(name: str) -> bool:
+    """Whether robots can exchange what such a selector learns (`osel_sim.interface.selector.Shares`).
+
+    Raises:
+        UnknownNameError: no such selector.
+    """
+    return all(hasattr(_load(name), method) for method in ("begin", "share", "absorb"))
+
+
+def check_can_share(names: Iterable[str]) -> None:
+    """Refuse selectors that cannot share.
+
+    Raises:
+        UsageError: naming the first of them, and our own that can.
+    """
+    for name in names:
+        if not can_share(name):
+            those = ", ".join(own for own in BUILT_IN if not own.startswith("vw_") and can_share(own))
+            raise UsageError(f"selector {name!r} has nothing that robots could exchange; those that do: {those}")
 
 
 def _load(name: str) -> Any:

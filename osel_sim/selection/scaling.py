@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 from osel_sim.interface.selector import Context, State
 from osel_sim.selection.features import Components, Sketch
 
+SEEN, TURN = "scale.seen", "scale.turn"
+"""Keys of the state: the contexts so far, and how fitted components are turned."""
+
 FIRST, LAST = 16, 2048
 """Components are fitted when so many contexts have been seen, whenever their number has doubled since, and for the last time at the second number."""
 
@@ -60,11 +63,11 @@ class RunningComponents:
     def state(self) -> State:
         """Arrays and values, copied."""
         fitted = {f"scale.fitted.{key}": value for key, value in self._fitted.state().items()}
-        return {"scale.seen": self._seen.copy(), "scale.turn": self._turn.copy(), **fitted}
+        return {SEEN: self._seen.copy(), TURN: self._turn.copy(), **fitted}
 
     def load(self, state: State) -> None:
         """Take over what `state` gave."""
-        self._seen, self._turn = state["scale.seen"].copy(), state["scale.turn"].copy()
+        self._seen, self._turn = state[SEEN].copy(), state[TURN].copy()
         prefix = "scale.fitted."
         self._fitted.load({key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)})
 

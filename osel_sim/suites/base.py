@@ -37,6 +37,7 @@ class BaseEnvironment(ABC):
         self.specification, self.horizon = specification, horizon
         self.instance: Any = None
         self.steps, self.success = 0, False
+        self._scene = ""
 
     # -- a suite's own -------------------------------------------------------------------------------------------------
 
@@ -60,6 +61,13 @@ class BaseEnvironment(ABC):
         """The action (D,) that holds still: zero, for actions that are changes. Others must say."""
         return self.specification.action.clip(np.zeros(self.specification.action.dimension))
 
+    def scene(self) -> str:
+        """Digest of the scene that `start` has just set up (`osel_sim.suites.scenes` helps), so that two logs can be compared scene by scene.
+
+        Empty, as by default, where it cannot be told.
+        """
+        return ""
+
     @property
     def subgoal_fraction(self) -> float:
         """Share of the subgoals reached so far; success where there are none."""
@@ -80,6 +88,11 @@ class BaseEnvironment(ABC):
         self.instance = instance
         self.steps, self.success = 0, False
         self.start(instance)
+        self._scene = self.scene()
+
+    def scene_digest(self) -> str:
+        """Digest of the scene as it was loaded; empty where it cannot be told."""
+        return self._scene
 
     def advance(self, action: NDArray[Any]) -> None:
         """One control step."""

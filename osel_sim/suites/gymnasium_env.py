@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec, Image
 from osel_sim.interface.policy import Actions
+from osel_sim.sim.fingerprint import Fingerprint
 from osel_sim.suites.base import BaseEnvironment, PlainInstance
+from osel_sim.suites.scenes import mujoco_of, of_mujoco, of_numbers
 
 SUCCESS = ("is_success", "success", "succeed")
 """What its `info` calls whether the task is done; the first that is there. The last is gym-hil's, and of what was made after it."""
@@ -83,12 +85,24 @@ class GymEnvironment(BaseEnvironment):
             horizon=_horizon(settings, env),
         )
         super().__init__(specification, _horizon(settings, env))
+        self._fingerprint: tuple[Any, Fingerprint] | None = None
         self._last: Actions | None = None
 
     def start(self, instance: PlainInstance) -> None:
         """Reset it with the instance's seed."""
         self._observation, _ = self._env.reset(seed=instance.simulator_seed, **self._options())
         self._last = None
+
+    def scene(self) -> str:
+        """Digest of MuJoCo's state and of what is observed; of the numbers observed alone, where something else simulates."""
+        observed = self._observation if isinstance(self._observation, Mapping) else {"observation": self._observation}
+        numbers, found = _leaves(observed), mujoco_of(self._env.unwrapped)
+        if found is None:
+            return of_numbers(numbers, self.instance)
+        model, data = found
+        if self._fingerprint is None or self._fingerprint[0] is not model:  # an environment may compile its scene anew
+            self._fingerprint = model, Fingerprint(model)
+        return of_mujoco(self._fingerprint[1], np.concatenate([data.qpos, *(values for _, values in numbers)]), self.instance)
 
     def act(self, action: Actions) -> bool:
         """One control step."""

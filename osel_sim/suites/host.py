@@ -26,7 +26,7 @@ from websockets.sync.server import serve as listen
 
 from osel_sim.core.errors import OselError
 from osel_sim.core.shown import TOKEN_VARIABLE
-from osel_sim.interface.environment import Environment, Expert, HasExpert
+from osel_sim.interface.environment import Environment, Expert, HasExpert, TellsScene
 from osel_sim.remote.codec import pack, unpack
 from osel_sim.remote.serving import stop_with_stdin
 from osel_sim.suites.base import PlainInstance
@@ -60,6 +60,7 @@ class Table:
             "observe": lambda env, message: {"observation": env.observe(message["cameras"], message["size"])},
             "image": lambda env, message: {"image": env.image(message["camera"], message["width"], message["height"], message["quality"])},
             "advance": lambda env, message: {"made": advance_chunk(env, message["actions"]), "status": status(env)},
+            "scene": lambda env, message: {"scene": env.scene_digest() if isinstance(env, TellsScene) else ""},
             "snapshot": lambda env, message: {"snapshot": env.snapshot()},
             "restore": self._restore,
             "expert": self._expert,

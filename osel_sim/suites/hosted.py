@@ -219,6 +219,10 @@ class HostedEnvironment:
         """Image (height, width, 3) of a camera."""
         return np.array(self._ask("image", camera=camera, width=width, height=height, quality=quality)["image"], np.uint8)
 
+    def scene_digest(self) -> str:
+        """Digest of the scene as it was loaded; empty where the simulator cannot tell."""
+        return str(self._ask("scene")["scene"])
+
     def snapshot(self) -> Any:
         """The state now: plain data, which a fresh host can go back to as well."""
         return self._instance, self._status, self._ask("snapshot")["snapshot"]

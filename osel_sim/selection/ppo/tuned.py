@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.ppo.sb3 import PPOSelector
-from osel_sim.selection.scaling import RunningComponents
+from osel_sim.selection.scaling import SEEN, TURN, RunningComponents
 
 
 class TunedPPOSelector(PPOSelector):
@@ -18,6 +18,10 @@ class TunedPPOSelector(PPOSelector):
     The paper's settings see contexts as the encoder gives them and take steps so small that hundreds of decisions change little. Here the network
     sees the leading principal components of the contexts so far, half whitened. The numbers were chosen on synthetic streams and on the choosing
     half of `assets/logs/suite`.
+
+    Robots share their weights as `PPOSelector` does, and see contexts through the first robot's components, which are sent beside them: 4 bytes a
+    weight, and 8 * (min(D, 256) + components) * (components + 1) at most for contexts of D numbers; some 70 kB. Until the first exchange each has
+    components of its own: where that comes after many training steps, what they learned before is blurred.
 
     It may stay with a worse policy for good, as PPO may: a softmax that has become sure of an action hardly draws another, the clipped objective
     takes small steps back, and nothing in the published form makes it try (6 of 80 seeds of four problems without context,
@@ -80,6 +84,17 @@ class TunedPPOSelector(PPOSelector):
     def network_inputs(self, contexts: NDArray[np.float32]) -> NDArray[np.float32]:
         """The stream as the network would see it."""
         return self._scale.stream(contexts)
+
+    def share(self) -> State:
+        """The weights, and how contexts become the components that they are weights of."""
+        return {**super().share(), **{key: value for key, value in self._scale.state().items() if key != SEEN}}
+
+    def absorb(self, messages: Sequence[State], own: int) -> None:
+        """Move towards the mean weights as `PPOSelector` does, and see contexts as the first robot does: only then do weights mean the same."""
+        super().absorb(messages, own)
+        fitted = next((message for message in messages if len(message[TURN])), None)
+        if fitted is not None:
+            self._scale.load({**fitted, SEEN: self._scale.state()[SEEN]})
 
     def _select(self, context: Context) -> Choice:
         self._scale.add(context)

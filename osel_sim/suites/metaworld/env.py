@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from osel_sim.interface.environment import Image
 from osel_sim.interface.policy import Actions
+from osel_sim.sim.fingerprint import Fingerprint
 from osel_sim.sim.turning import nudged, shifted, turned_light
 from osel_sim.suites.base import BaseEnvironment, PlainInstance
 from osel_sim.suites.metaworld.tasks import HORIZON, SPECIFICATION, TABLE_TOPS, load_tasks
 from osel_sim.suites.mujoco_view import MujocoView
+from osel_sim.suites.scenes import of_mujoco
 
 UPSIDE_DOWN = ("corner", "corner2", "corner3")
 """Cameras that hang upside down; LeRobot turns the picture of `corner2`, too."""
@@ -49,6 +51,7 @@ class MetaworldEnvironment(BaseEnvironment):
         self._observation = np.zeros(39)
         self._reached: set[str] = set()
         self._view = MujocoView(model, self._env.data, self._describe, UPSIDE_DOWN)
+        self._fingerprint = Fingerprint(model)
 
     def start(self, instance: PlainInstance) -> None:
         """Reset to an instance, as if nothing had been before."""
@@ -64,6 +67,10 @@ class MetaworldEnvironment(BaseEnvironment):
         self._observation = env.reset()[0]
         self._reached = set()
         self._view.dress(lambda model: _dress(model, instance.details))
+
+    def scene(self) -> str:
+        """Digest of where everything is, the goal included, and of how it looks."""
+        return of_mujoco(self._fingerprint, np.append(self._env.data.qpos, self._env._target_pos), self.instance)
 
     def act(self, action: Actions) -> bool:
         """One control step."""

@@ -13,11 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from osel_sim.interface.environment import Image
 from osel_sim.interface.policy import Actions
 from osel_sim.interface.robot import Gripper, LightMeshes, Robot
+from osel_sim.sim.fingerprint import Fingerprint
 from osel_sim.sim.gl import quiet_robosuite
 from osel_sim.sim.light_meshes import lighten
 from osel_sim.suites.base import BaseEnvironment, PlainInstance
 from osel_sim.suites.mujoco_view import MujocoView
 from osel_sim.suites.robosuite.tasks import CAMERAS, STOCK, parts, specification
+from osel_sim.suites.scenes import of_mujoco
 
 SHOWN = (1, 2)
 """Geom groups; robosuite's collision geoms are in group 0."""
@@ -45,7 +47,7 @@ class RobosuiteEnvironment(BaseEnvironment):
         self._model, self._data = self._env.sim.model._model, self._env.sim.data._data
         self._robot = _description(self._env, arm)
         self._site = self._model.site(self._robot.grip_site).id
-        self._control = self._new_control()
+        self._control, self._fingerprint = self._new_control(), Fingerprint(self._model)
         xml = self._env.sim.model.get_xml()
         self._view = MujocoView(
             self._model,
@@ -68,6 +70,10 @@ class RobosuiteEnvironment(BaseEnvironment):
             np.random.set_state(before)
         self._control = self._new_control()
         self._settle()
+
+    def scene(self) -> str:
+        """Digest of where everything is."""
+        return of_mujoco(self._fingerprint, self._data.qpos, self.instance)
 
     def act(self, action: Actions) -> bool:
         """One control step."""
@@ -109,13 +115,15 @@ class RobosuiteEnvironment(BaseEnvironment):
         mujoco.mj_getState(self._model, self._data, state, kind)
         world = {name: getattr(self._model, name).copy() for name in ("body_pos", "body_quat", "site_pos", "site_rgba")}
         arm = (self._control.gripper_command, self._home.copy())
-        return {"instance": self.instance, "state": state, "world": world, "arm": arm, "steps": self.steps, "success": self.success}
+        counts = {"steps": self.steps, "success": self.success}
+        return {"instance": self.instance, "scene": self._scene, "state": state, "world": world, "arm": arm, **counts}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Back to a snapshot of this task."""
         import mujoco
 
         self.instance, self.steps, self.success = snapshot["instance"], snapshot["steps"], snapshot["success"]
+        self._scene = snapshot["scene"]
         for name, value in snapshot["world"].items():
             getattr(self._model, name)[:] = value
         mujoco.mj_setState(self._model, self._data, snapshot["state"], mujoco.mjtState.mjSTATE_INTEGRATION)

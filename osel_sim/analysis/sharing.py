@@ -1,0 +1,230 @@
+"""A log replayed to several robots at once: what sharing is worth, against each alone and against one that sees everything."""
+
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from osel_sim.analysis.engine import WARM, Setup, one_thread, one_thread_worker
+from osel_sim.analysis.log import LoggedOutcomes
+from osel_sim.analysis.streams import Streams, draw_streams
+from osel_sim.analysis.warm_start import show
+from osel_sim.core.errors import WorkerError
+from osel_sim.core.processes import Lost, Work, run_jobs
+from osel_sim.interface.selector import Selector, SelectorFactory
+from osel_sim.selection.dealing import By, deal, groups
+from osel_sim.selection.fleet import Fleet, Sharing, robot_seed
+from osel_sim.statistics.intervals import bootstrap_mean_interval
+
+SOON = ("auto", "epsilon_greedy", "lints", "linucb", "thompson", "ucb1")
+"""Selectors that are replayed to robots unless it is said which: those that can share and take seconds, not hours."""
+POINTS = 100
+"""A curve has at most so many."""
+RESAMPLES = 10_000
+
+
+@dataclass(frozen=True)
+class Robots:
+    """Who learns from what.
+
+    Attributes:
+        count: of the robots.
+        sharing: what they exchange; `none` and `all` are replayed beside it.
+        by: what their streams differ in; None: nothing.
+    """
+
+    count: int
+    sharing: Sharing
+    by: By | None = None
+
+    @property
+    def ways(self) -> dict[str, Sharing]:
+        """What is compared: each alone, as asked, and one that sees everything."""
+        alone, central = Sharing(), Sharing(central=True)
+        return {str(way): way for way in (alone, self.sharing, central)}
+
+
+@dataclass(frozen=True)
+class _Material:
+    """What workers need: as `osel_sim.analysis.engine` has it, and the places of each seed's stream at which each robot decides, (rounds, robots)."""
+
+    contexts: NDArray[np.float32]
+    rewards: NDArray[np.float64]
+    policies: tuple[str, ...]
+    streams: Streams
+    seeds: tuple[int, ...]
+    places: tuple[NDArray[np.int64], ...]
+    setup: Setup
+    robots: Robots
+    factories: Mapping[str, SelectorFactory]
+
+
+_Job = tuple[str, str, int]
+"""Selector, way to share, position of the seed."""
+_Played = tuple[NDArray[np.float64], float]
+"""Rewards (rounds, robots), and the mean number of bytes of a message."""
+
+
+def share_log(
+    log: LoggedOutcomes,
+    setup: Setup,
+    selectors: Sequence[str],
+    robots: Robots,
+    seeds: Sequence[int],
+    decisions: int | None = None,
+    workers: int = 1,
+    count: Callable[[int], Any] = lambda decisions: None,
+    factories: Mapping[str, SelectorFactory] | None = None,
+) -> dict[str, Any]:
+    """Replay a log to robots that share as asked, to robots that do not, and to one selector for all of them.
+
+    Args:
+        log: complete instances only. setup, seeds, decisions, workers, factories: as `osel_sim.analysis.engine` has them.
+        selectors: those that can share (`osel_sim.selection.registry.check_can_share`).
+        count: called with every job's number of decisions.
+
+    Returns:
+        what `replay.json` has as `sharing`; see `docs/sharing.md`.
+
+    Raises:
+        UsageError: too few tasks, levels or arms for so many robots, or streams too short.
+    """
+    rewards = log.rewards(setup.weights)
+    streams = draw_streams(rewards, seeds, decisions)
+    owners = None
+    if robots.by is not None:
+        values = [getattr(instance, robots.by) for instance in log.instances]
+        owner = groups(values, robots.count, robots.by)
+        owners = np.array([owner[value] for value in values], np.int64)
+    places = [deal(owners, order, robots.count) for order in streams.order]
+    rounds = min(map(len, places))
+    cut = tuple(own[:rounds] for own in places)
+    material = _Material(log.contexts, rewards, log.policies, streams, tuple(seeds), cut, setup, robots, factories or {})
+    jobs = [(name, way, seed) for name in selectors for way in robots.ways for seed in range(len(seeds))]
+    played: dict[_Job, _Played] = {}
+    with closing(_run(material, jobs, workers)) as results:
+        for job, one in results:
+            played[job] = one
+            count(one[0].size)
+    return {
+        "robots": robots.count,
+        "by": robots.by,
+        "share": str(robots.sharing),
+        "delay": robots.sharing.delay,
+        "decisions": rounds,
+        "at": (_thinned(rounds) + 1).tolist(),
+        "selectors": {name: _entry(name, robots, played, len(seeds)) for name in selectors},
+    }
+
+
+def share_total(robots: Robots, selectors: Sequence[str], seeds: int, decisions: int) -> int:
+    """How many decisions `share_log` makes at most."""
+    return len(robots.ways) * len(selectors) * seeds * decisions
+
+
+def _entry(name: str, robots: Robots, played: Mapping[_Job, _Played], seeds: int) -> dict[str, Any]:
+    """What a selector came to, by way to share."""
+    tables = {way: np.stack([played[name, way, seed][0] for seed in range(seeds)]) for way in robots.ways}
+    means = {way: table.mean(axis=(1, 2)) for way, table in tables.items()}
+    share = str(robots.sharing)
+    closed, ends, gain = _closed(means["none"], means[share], means["all"])
+    return {
+        "ways": {way: _way(tables[way], means[way]) for way in robots.ways},
+        "gain": gain[0],
+        "gain_ci95": gain[1],
+        "gap_closed": closed,
+        "gap_closed_ci95": ends,
+        "message_bytes": float(np.mean([played[name, share, seed][1] for seed in range(seeds)])),
+    }
+
+
+def _way(table: NDArray[np.float64], means: NDArray[np.float64]) -> dict[str, Any]:
+    at = _thinned(table.shape[1])
+    curves = table.mean(axis=2).cumsum(axis=1) / np.arange(1, table.shape[1] + 1)
+    several = len(means) > 1
+    spread = 1.96 * curves.std(axis=0, ddof=1) / np.sqrt(len(curves)) if several else None
+    return {
+        "mean_reward": float(means.mean()),
+        "ci95": list(bootstrap_mean_interval(means)) if several else None,
+        "curve": curves.mean(axis=0)[at].tolist(),
+        "spread": None if spread is None else spread[at].tolist(),
+    }
+
+
+def _closed(
+    alone: NDArray[np.float64], shared: NDArray[np.float64], whole: NDArray[np.float64]
+) -> tuple[float | None, list[float] | None, tuple[float, list[float] | None]]:
+    """Share of the gap between alone and all-seeing that sharing closes, and the gap, with 95% intervals over the seeds, which are paired.
+
+    None where the gap is not clear of 0: a share of nothing says nothing.
+    """
+    gap = float(whole.mean() - alone.mean())
+    if len(alone) < 2:
+        return (float((shared.mean() - alone.mean()) / gap) if gap > 0 else None), None, (gap, None)
+    rows = np.random.default_rng(0).integers(len(alone), size=(RESAMPLES, len(alone)))
+    gaps, gains = (whole - alone)[rows].mean(axis=1), (shared - alone)[rows].mean(axis=1)
+    ends = np.quantile(gaps, [0.025, 0.975]).tolist()
+    if ends[0] <= 0:
+        return None, None, (gap, ends)
+    return float((shared.mean() - alone.mean()) / gap), np.quantile(gains / np.maximum(gaps, 1e-12), [0.025, 0.975]).tolist(), (gap, ends)
+
+
+def _thinned(rounds: int) -> NDArray[np.int64]:
+    return np.unique(np.linspace(0, rounds - 1, min(POINTS, rounds)).round().astype(np.int64))
+
+
+def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Generator[tuple[_Job, _Played]]:
+    if workers == 1:
+        for job in jobs:
+            with one_thread():
+                played = _play(material, job)
+            yield job, played
+        return
+    with closing(run_jobs(partial(_player, material), jobs, workers)) as events:
+        for event in events:
+            if isinstance(event, Lost):
+                raise event.error or WorkerError(f"a worker process of the replay died twice ({event.cause}; out of memory?); try --workers 1")
+            yield event.job, event.value
+
+
+def _player(material: _Material) -> Work[_Job, _Played]:
+    one_thread_worker()
+    return lambda job, _: [_play(material, job)]
+
+
+def _play(material: _Material, job: _Job) -> _Played:
+    """Show its stream to the robots of one seed, each of which sees the rewards of its choices only."""
+    name, way, number = job
+    robots, streams = material.robots, material.streams
+    fleet = Fleet(partial(_selector, material, name, number), robots.count, robots.ways[way])
+    fleet.begin()
+    rewards = streams.rewards(material.rewards, number)
+    contexts = material.contexts[streams.order[number]]
+    contexts.flags.writeable = False
+    places, column = material.places[number], {policy: index for index, policy in enumerate(material.policies)}
+    received = np.zeros(places.shape)
+    for step, now in enumerate(places):
+        for robot, place in enumerate(now):
+            choice = fleet.select(robot, contexts[place])
+            received[step, robot] = rewards[place, column[choice.policy]]
+            fleet.update(robot, contexts[place], choice, float(received[step, robot]))
+        fleet.end_round()
+    return received, fleet.message_bytes
+
+
+def _selector(material: _Material, name: str, number: int, robot: int) -> Selector:
+    """A robot's selector, as `replay_one` makes that of a stream."""
+    from osel_sim.selection.registry import make_selector
+
+    seed, setup = robot_seed(material.seeds[number], robot), material.setup
+    size, factory = material.contexts.shape[1], material.factories.get(name)
+    if factory is not None:
+        return factory(material.policies, size, seed)
+    selector = make_selector(name.removesuffix(WARM), material.policies, size, seed, **setup.settings.get(name, {}))
+    if name.endswith(WARM) and setup.warm_start is not None:
+        show(selector, setup.warm_start, material.policies, material.seeds[number])
+    return selector
