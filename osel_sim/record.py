@@ -64,8 +64,12 @@ def _print_decision(result: "RecordResult") -> None:
 
 
 def _print_next(folder: Path) -> None:
+    from osel_sim.api.replay_moments import has_moments
     from osel_sim.cli.next_step import print_next
 
+    if has_moments(folder):
+        print_next(("compares monitors on it: is it worth handing over?", "replay", [folder]), ("makes a page of it", "report", [folder, "--open"]))
+        return
     print_next(
         ("replays it to selectors: is routing worth it?", "replay", [folder]),
         ("makes a page of it", "report", [folder, "--open"]),

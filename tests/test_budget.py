@@ -14,10 +14,12 @@ from osel_sim.episodes.most_costs import most_costs
 from osel_sim.formats import library
 from osel_sim.formats.budget import read_budget
 from osel_sim.formats.journal import read_journal
+from osel_sim.formats.merged_policy import merged
 from osel_sim.reporting.budget_section import run_budget
 from osel_sim.run import main as run_main
 from osel_sim.selection.budget import Budget, Budgeted, dual_price
 from osel_sim.selection.registry import BUILT_IN, make_selector
+from osel_sim.selection.state import load_state
 from osel_sim.suites.registry import select_tasks
 
 POLICIES = ("local", "remote")
@@ -135,6 +137,8 @@ def test_no_episode_costs_more_than_its_policy_s_file_allows(world):
     most = most_costs(specs, specs, HORIZON, task.specification)
     assert most["calm"] == 0.0
     assert 0.02 * HORIZON + 4 * 0.1 < most["wild"] < 0.02 * HORIZON + 4 * 0.3  # and what the messages weigh
+    both = merged("merge:calm+wild", lambda name: library.load_policy(name, world / "policies"))
+    assert most_costs([both], [both, *specs], HORIZON, task.specification)["merge:calm+wild"] == most["wild"]  # whose own price is nothing
 
 
 def test_a_live_run_keeps_to_its_budget_and_resumes_to_the_same_bytes(world, capsys):
@@ -164,8 +168,10 @@ def test_a_live_run_keeps_to_its_budget_and_resumes_to_the_same_bytes(world, cap
     settings["settings"]["out"] = str(cut)
     (cut / "run.json").write_text(json.dumps(settings))
     assert run_main(["--out", str(cut), "--resume"]) == 0
-    for name in ("episodes.jsonl", "summary.json", "budget.json", "selector.safetensors"):
+    for name in ("episodes.jsonl", "summary.json", "budget.json"):
         assert (cut / name).read_bytes() == (whole / name).read_bytes(), name
+    one, other = (load_state(folder / "selector.safetensors") for folder in (cut, whole))  # whose keys stand in any order
+    assert {key: np.asarray(value).tolist() for key, value in one.items()} == {key: np.asarray(value).tolist() for key, value in other.items()}
     capsys.readouterr()
     assert run_main(["--out", str(whole), "--resume", "--episodes", "9"]) == 2
     assert "budget.decisions was 4 at the beginning" in capsys.readouterr().err

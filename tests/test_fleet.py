@@ -62,6 +62,7 @@ def test_without_robots_a_replay_is_as_it_was(log, tmp_path):
         ({"robots": 4, "selectors": ["random"]}, "name a selector that learns"),
         ({"robots": 4, "share": "every:0"}, "--share must be none, all, or every:N"),
         ({"robots": 2, "selectors": ["ucb1"], "join": ["policy_1@9"]}, "--robots is for streams that do not change"),
+        ({"robots": 2, "selectors": ["ucb1"], "budget_cents": 9}, "is for one robot"),
         ({"share": "every:20"}, "--share is for several robots; say how many with --robots"),
         ({"share_delay": 3}, "--share-delay is for several robots"),
         ({"robots_by": "task"}, "--robots-by is for several robots"),

@@ -45,7 +45,10 @@ class Told:
 
 class Points(Subscriber):
     def __init__(self):
-        self.points, self.turns = [], []
+        self.points, self.turns, self.drove = [], [], []
+
+    def on_step(self, frame):
+        self.drove.append(frame.policy)
 
     def on_point(self, point, turn):
         self.points.append(point)
@@ -87,6 +90,7 @@ def test_new_policy_waits_on_its_network_and_the_old_chunk_is_dropped(env, insta
     assert sum(one.price for one in told.by_policy.values()) == pytest.approx(outcome.price)
     assert told.by_policy["small"].price == pytest.approx(PRICE.of(8, 1, 0.5))
     assert [point.call for point in seen.points] == [1, 2] and told.points == 2
+    assert seen.drove == ["small"] * 8 + ["blocking"] * (outcome.steps - 8)  # what videos write into the frame
 
 
 def test_async_policy_finishes_the_chunk_of_the_one_before(env, instance):

@@ -11,6 +11,7 @@ from osel_sim.episodes.drivers import Drivers, choose_policies, with_fallbacks
 from osel_sim.episodes.expected_costs import expected_costs
 from osel_sim.episodes.loop import Driver, run_episode
 from osel_sim.episodes.merged_caller import AGREEMENT, MergedCaller, merge_chunks
+from osel_sim.episodes.most_costs import most_costs
 from osel_sim.formats.library import load_policy
 from osel_sim.formats.merged_policy import MergedSpec, merged
 from osel_sim.formats.policy_file import Price, Remote
@@ -195,6 +196,8 @@ def test_a_merge_is_all_that_its_parts_are():
     large = load_policy("remote_large")
     costs = expected_costs([spec, large], RewardWeights(0.0, 0.01), 100, specification())
     assert costs[spec.name] == pytest.approx(costs["remote_large"])  # the local part is free
+    most = most_costs([spec, large], with_fallbacks([spec, large]), 120, specification())
+    assert most[spec.name] == pytest.approx(most["remote_large"]) and most[spec.name] > 120 * 0.1125
 
 
 @pytest.mark.parametrize(

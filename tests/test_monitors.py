@@ -1,15 +1,22 @@
 """Monitors on decision points that were written down, and on made-up problems whose answer is known."""
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from synthetic_moments import ENCODER, POLICIES, stuck_log
 
-from osel_sim.core.errors import UnknownNameError, UsageError
+from osel_sim.analysis.moment_warm_start import check_can_start_warm, read_warm_start, show_moments
+from osel_sim.core.errors import DataError, UnknownNameError, UsageError
+from osel_sim.formats.journal import to_line
+from osel_sim.formats.points import Points, to_points
 from osel_sim.interface.monitor import Candidate, DecisionPoint, Told, Turn, Watched
 from osel_sim.interface.outcome import Monitored, Outcome, Seconds
 from osel_sim.selection.monitors.registry import ABOUT, BUILT_IN, make_monitor, monitor_locations
+from osel_sim.selection.reward import RewardWeights, reward, to_go
 
 CANDIDATES = (Candidate("small", False), Candidate("large", True), Candidate("special", True))
 TWO = CANDIDATES[:2]
@@ -47,6 +54,8 @@ def test_every_monitor_is_listed_with_a_line_about_it():
         ("blind:0", "K must be an integer of at least 1, got '0'"),
         ("blind:2.5", "K must be an integer of at least 1, got '2.5'"),
         ("blind:x", "got 'x'"),
+        ("blind:8:", "write blind:K or blind:K:TO"),
+        ("blind:" + "9" * 400, "K must be an integer"),
         ("blind:8:larg", "did you mean 'large'"),
         ("random:1.5", r"P must be a number in \[0, 1\], got '1.5'"),
         ("random:nan", "got 'nan'"),
@@ -238,11 +247,79 @@ def test_sb3_learns_on_the_environment():
     assert total / episodes > 0.85  # best: 0.97 unless stuck, then 0.87, or 0.77 handing over at once
 
 
-def test_reward_to_go_leaves_out_what_was_spent():
-    from osel_sim.selection.reward import RewardWeights, reward, to_go
+def written():
+    picture = np.array([0.1, -2.0], np.float32)
+    seen = replace(point(picture=picture, change=None, overlap=None), look=Told(picture, (None,), {"large": 0.25}))
+    blind = replace(point(8, "large"), look=Told())
+    return Points(3, (seen, blind), (Turn("large", "why", {"small": 0.25, "large": 0.75}), Turn("large")))
 
+
+def test_points_are_read_as_they_were_written():
+    line = json.loads(to_line(written().to_dict()))
+    again = to_points(line, 3, Path("points.jsonl"), ("small", "large"), "do it")
+    assert again.to_dict() == written().to_dict() and again.turns == written().turns
+    assert (again.points[0].look.picture() == written().points[0].look.picture()).all()
+    assert again.points[0].look.change() is None and again.points[0].look.difference("large") == 0.25
+    for looked in (lambda look: look.picture(), lambda look: look.change(), lambda look: look.difference("large")):
+        with pytest.raises(DataError, match=r"kept|was not asked"):
+            looked(again.points[1].look)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda line: line.update(version=2), "version must be 1, got 2"),
+        (lambda line: line.update(index=4), "index must be 3, got 4"),
+        (lambda line: line.pop("points"), "points is missing"),
+        (lambda line: line.update(points=[1]), "points must be a list of objects"),
+        (lambda line: line["points"][0].update(call=-1), "point 0: call must be an integer of 0 or more"),
+        (lambda line: line["points"][1].pop("moved"), "point 1: moved is missing"),
+        (lambda line: line["points"][0].update(truth=1), "point 0: has an unknown field"),
+        (lambda line: line["points"][0].update(picture="?"), "point 0: picture is no Base64"),
+        (lambda line: line["points"][0].update(picture="AADAfw=="), "point 0: picture is not all finite"),
+        (lambda line: line["points"][0].update(policy="larger"), "point 0: .*larger.* is no policy of the run"),
+        (lambda line: line["points"][0].update(propensities={"small": 0.5}), "point 0: propensities must be probabilities"),
+        (lambda line: line["points"][0].update(changes=[2.0]), "point 0: changes must be"),
+    ],
+)
+def test_points_that_cannot_be_are_refused(change, said):
+    line = written().to_dict()
+    change(line)
+    with pytest.raises(DataError, match=rf"points.jsonl, line 4: .*{said}"):
+        to_points(line, 3, Path("points.jsonl"), ("small", "large"), "do it")
+
+
+def test_listing_shows_monitors():
+    from osel_sim.cli.listing import listing
+
+    assert {row["name"]: row["about"] for row in listing()["monitors"]}.items() >= ABOUT.items()
+
+
+def test_reward_to_go_leaves_out_what_was_spent():
     weights = RewardWeights(0.2, 0.01)
     end = replace(outcome(200), success=True, price=3.0)
     total = reward(end, weights)
     rest = to_go(total, [1.0, 10.0], [20, 200], [0.0, 3.0], weights)
     assert rest == (pytest.approx(total), pytest.approx(1.0))  # after one second log10 has taken nothing off; at the end all was spent
+
+
+def test_value_starts_warm_from_a_table_of_moments(tmp_path):
+    """Where the local policy is stuck, the picture shows it, and the remote one helps before call 4 and no more before call 8."""
+    weights = RewardWeights(0.0, 0.005)
+    log = read_warm_start(stuck_log(tmp_path / "log"), ENCODER, POLICIES)
+    monitor = make_monitor("value", (Candidate("local", False), Candidate("remote", True)), log.seen.pictures.shape[1], 0)
+    own = set(log.whole.keys[:40])
+    assert show_moments(monitor, log, weights, own) == len(log) - 40
+    seen = {"overlap": 0.0, "moved": 0.0, "change": 0.0, "seconds": 0.0, "price": 0.0, "time_used": 0.0}
+    for stuck in (False, True):
+        picture = np.array([3.0 * stuck] + [0.0] * 7, np.float32)
+        expected = monitor.expected(point(4, "local", picture, **seen))
+        assert (expected["remote"] > expected["local"] + 0.1) == stuck
+    with pytest.raises(UsageError, match="give the same --encoder"):
+        read_warm_start(tmp_path / "log", "another@2", POLICIES)
+
+
+@pytest.mark.parametrize("name", ["never", "blind:4", "ppo"])
+def test_what_learns_nothing_of_others_cannot_start_warm(name):
+    with pytest.raises(UsageError, match="cannot start warm"):
+        check_can_start_warm(name, make_monitor(name, TWO, DIM, 0))

@@ -1,5 +1,6 @@
 """`python -m osel_sim.record --moments K` with real workers and servers: every way on, the same bytes however it went."""
 
+import dataclasses
 import shutil
 import signal
 import subprocess
@@ -10,9 +11,11 @@ import pytest
 from run_helpers import command, environment, execute, make_world, wait_for_lines
 
 from osel_sim.episodes.moment_recording import MOMENT_SHARDS
+from osel_sim.formats.journal import JOURNAL, read_lines, to_decision
 from osel_sim.formats.moments import MOMENTS, SEEN, SIGNALS, read_moments
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.record import main as record_main
+from osel_sim.run import main as run_main
 
 SIZE = ("--instances", 2, "--action-noise", 0.05, "--moments", 1, "--most-moments", 2)
 
@@ -127,3 +130,21 @@ def test_wrong_settings_get_one_line(world, capsys, flags, complaint):
     assert code == 2
     assert complaint in capsys.readouterr().err
     assert not (world / "wrong").exists()
+
+
+@pytest.mark.parametrize(("first", "second", "call"), [("calm", "wild", 1), ("calm", "wild", 2), ("wild", "calm", 2)])
+def test_a_row_is_what_a_live_run_with_that_handover_comes_to(world, reference, first, second, call):
+    out = world / f"live-{first}-{call}"
+    flags = ["--selector", f"fixed:{first}", "--monitor", f"blind:{call}:{second}", "--decide-every", 1, "--action-noise", 0.05]
+    arguments = command(world, "run", *flags, "--episodes", 1, "--seed", 0, "--out", out)
+    assert run_main(list(map(str, arguments[3:]))) == 0
+    (data, _), *_ = read_lines(out / JOURNAL)
+    live = to_decision(data, 0, out / JOURNAL)
+    row = next(
+        row for row in read_moments(reference).rows if (row.first, row.call, row.second) == (first, call, second) and row.instance.endswith("/0")
+    )
+    assert row.outcome == dataclasses.replace(live.outcome, monitored=None)
+    told = live.outcome.monitored
+    assert told is not None and [(one.call, one.step, one.to) for one in told.handoffs] == [(call, row.step, second)]
+    assert told.by_policy[first].price == row.price_first
+    assert told.duty_steps == row.remote_steps / row.steps

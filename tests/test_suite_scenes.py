@@ -13,7 +13,7 @@ from osel_sim.suites.gymnasium_env import GymEnvironment, GymSettings
 from osel_sim.suites.registry import find_task
 from osel_sim.suites.scenes import DECIMALS, mujoco_of, of_mujoco, of_numbers
 
-INSTANCE = PlainInstance("reach", 3, 0, "test", "reach for it")
+INSTANCE = PlainInstance("reach", 3, "test", "reach for it")
 MODEL = "<mujoco><worldbody><body name='a'><freejoint/><geom size='0.1'/></body></worldbody></mujoco>"
 
 
@@ -21,13 +21,13 @@ def test_a_digest_does_not_depend_on_last_bits_and_on_everything_else():
     import mujoco
 
     model = mujoco.MjModel.from_xml_string(MODEL)
-    positions = np.array([0.12345, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
+    positions = np.array([0.1234, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
     first = of_mujoco(Fingerprint(model), positions, INSTANCE)
     assert first == of_mujoco(Fingerprint(model), positions + 1e-10, INSTANCE) and len(first) == 16
     others = [
         of_mujoco(Fingerprint(model), positions + 10.0**-DECIMALS, INSTANCE),
-        of_mujoco(Fingerprint(model), positions, PlainInstance("reach", 3, 0, "test", "reach for that")),
-        of_mujoco(Fingerprint(model), positions, PlainInstance("reach", 3, 0, "test", "reach for it", details={"light": 0.5})),
+        of_mujoco(Fingerprint(model), positions, PlainInstance("reach", 3, "test", "reach for that")),
+        of_mujoco(Fingerprint(model), positions, PlainInstance("reach", 3, "test", "reach for it", details={"light": 0.5})),
     ]
     model.geom_size[0] *= 2
     others.append(of_mujoco(Fingerprint(model), positions, INSTANCE))
@@ -80,10 +80,10 @@ class Point:
 
 def test_what_is_observed_tells_where_something_else_simulates():
     env = GymEnvironment(Point(), GymSettings("point"))
-    first, other = (Start(env, PlainInstance("point", seed, 0, "test", "go")) for seed in (1, 2))
+    first, other = (Start(env, PlainInstance("point", seed, "test", "go")) for seed in (1, 2))
     env.advance(np.ones(2, np.float32))
     assert first.scene and other.scene and first.scene != other.scene == env.scene_digest(), "as it was loaded, whatever has moved since"
-    assert Start(env, PlainInstance("point", 1, 0, "test", "go")).scene == first.scene
+    assert Start(env, PlainInstance("point", 1, "test", "go")).scene == first.scene
 
 
 @pytest.mark.slow

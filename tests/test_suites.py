@@ -12,22 +12,25 @@ import numpy as np
 import pytest
 
 import osel_sim
-from osel_sim.core.errors import ContentError, MissingPackageError, UnknownNameError, UsageError
+from osel_sim.core.errors import ContentError, DataError, MissingPackageError, UnknownNameError, UsageError
 from osel_sim.episodes.drivers import Drivers, choose_policies, left_out
 from osel_sim.episodes.live import LiveOptions, LiveRun
 from osel_sim.episodes.loop import Driver, Subscriber, run_episode
-from osel_sim.episodes.run_subscribers import RunSubscriber
+from osel_sim.episodes.run_subscribers import RunSubscriber, TimingFile
 from osel_sim.episodes.start import Start
+from osel_sim.episodes.watching import RunMonitor
 from osel_sim.formats.conventions import Conventions
 from osel_sim.formats.journal import read_journal
 from osel_sim.formats.policy_file import load_policy_file
 from osel_sim.formats.rollout_log import DECLARED, read_rollouts
 from osel_sim.interface.call import Call
 from osel_sim.interface.environment import ActionSpec, EnvironmentSpec
+from osel_sim.interface.monitor import Candidate
 from osel_sim.interface.specification import specification
 from osel_sim.interface.suite import Task
 from osel_sim.policy.environment_fit import misfits
 from osel_sim.policy.registry import session_factory
+from osel_sim.selection.monitors.registry import make_monitor
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
 from osel_sim.suites.base import BaseEnvironment
@@ -496,6 +499,43 @@ def test_subscribers_are_told_of_a_run_and_one_that_fails_leaves_it_whole(tmp_pa
         assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "cut" / name).read_bytes()
     decisions = read_journal(tmp_path / "whole" / "episodes.jsonl")
     assert {decision.task for decision in decisions} <= {"toy:reach", "toy:hurry"}
+
+
+def watched(folder: Path, drivers: Drivers, name: str, subscriber: RunSubscriber) -> LiveRun:
+    folder.mkdir(exist_ok=True)
+    names, weights = ["toy_greedy", "scripted_expert"], RewardWeights(0.1, 0.0)
+    monitor = make_monitor(name, [Candidate("toy_greedy", False), Candidate("scripted_expert", True)], 3, 0)
+    options = LiveOptions(0, weights, counterfactual=True)
+    run_monitor = RunMonitor(monitor, names, 1, Colour(), weights)
+    return LiveRun(
+        folder, select_tasks(["toy:all"]), Colour(), drivers, make_selector("random", names, 3, 0), options, [TimingFile(), subscriber], run_monitor
+    )
+
+
+@pytest.mark.parametrize("name", ["value:9", "random:0.5", "ppo", "disagreement:0.1"])
+def test_a_run_with_a_monitor_that_was_cut_off_goes_on_to_the_same_bytes(name, tmp_path):
+    toy = find_task("toy:reach").specification
+    files = ("episodes.jsonl", "points.jsonl", "counterfactual.jsonl", "contexts.npz")
+    with Drivers(choose_policies(["toy_greedy", "scripted_expert"], toy, POLICIES), toy) as drivers:
+        whole = watched(tmp_path / "whole", drivers, name, Told())
+        whole.run(12)
+        with pytest.raises(OSError, match="the disk is full"):
+            watched(tmp_path / "cut", drivers, name, Told(fails_at=7)).run(12)
+        assert (tmp_path / "cut" / "points.jsonl").read_bytes().count(b"\n") == 8  # written before the decision, which is made again
+        resumed = watched(tmp_path / "cut", drivers, name, Told())
+        resumed.replay()
+        resumed.run(12)
+        for file in files:
+            assert (tmp_path / "whole" / file).read_bytes() == (tmp_path / "cut" / file).read_bytes(), file
+        assert resumed.alone == whole.alone and len(whole.alone) == 12
+        told = [decision.monitored for decision in read_journal(tmp_path / "whole" / "episodes.jsonl")]
+        assert any(one.handoffs for one in told) or name == "disagreement:0.1"
+        for one, decision in zip(told, whole.decisions, strict=True):
+            assert sum(driving.steps for driving in one.by_policy.values()) == decision.steps
+        damaged = (tmp_path / "cut" / "points.jsonl").read_text().replace('"why": "', '"why": "not ', 1)
+        (tmp_path / "cut" / "points.jsonl").write_text(damaged)
+        with pytest.raises(DataError, match="is not what was written"):
+            watched(tmp_path / "cut", drivers, name, Told())
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ class BudgetPlan:
             "hindsight": [best_within(rewards, prices, pace, free) for pace in whole],
             "mix": [best_within(rewards.mean(axis=0)[None], prices.mean(axis=0)[None], pace, free) for pace in whole],
         }
-        expected = [_expected(log.rewards(weights), log.price, pace, free) for pace in whole]
+        expected = [_expected(log.rewards(weights), log.price, pace, free, best) for pace, (best, _) in zip(whole, bounds["hindsight"], strict=True)]
         return {
             "asked": self.asked,
             "period": self.budgets[0].decisions,
@@ -123,18 +123,27 @@ def best_within(rewards: Array, prices: Array, pace: float, free: bool) -> tuple
     return float((rewards - high * prices).max(axis=1).mean()) + high * pace, high
 
 
-def _expected(rewards: Array, prices: Array, pace: float, free: bool) -> float | None:
-    """Chosen on one half of an instance's repeats at the price of a cent there, scored on the other half, both ways; None without repeats."""
+def _expected(rewards: Array, prices: Array, pace: float, free: bool, hindsight: float) -> float | None:
+    """What the hindsight oracle loses where it chooses on one half of an instance's repeats and is scored on the other, both ways, taken off what it
+    has on all instances; from those with repeats, which have to be a fair sample. None where there are none.
+
+    Args:
+        rewards, prices: (N, P, R).
+        hindsight: reward of the hindsight oracle, by `best_within` on all instances.
+    """
     known = np.isfinite(rewards)
     number = np.cumsum(known, axis=2) - 1
     halves = [tuple(mean_over_repeats(np.where(known & (number % 2 == parity), table, np.nan)) for table in (rewards, prices)) for parity in (0, 1)]
-    if not free or not all(np.isfinite(table).all() for half in halves for table in half):
+    rows = np.logical_and.reduce([np.isfinite(table).all(axis=1) for half in halves for table in half])
+    if not free or not rows.any():
         return None
     values = []
     for (own, costs), (others, _) in (halves, halves[::-1]):
-        _, dual = best_within(own, costs, pace, free)
-        values.append(float(others[np.arange(len(own)), (own - dual * costs).argmax(axis=1)].mean()))
-    return float(np.mean(values))
+        _, dual = best_within(own[rows], costs[rows], pace, free)
+        chosen = (own[rows] - dual * costs[rows] - 1e-12 * costs[rows]).argmax(axis=1)
+        values.append(float(others[rows][np.arange(len(chosen)), chosen].mean()))
+    here, _ = best_within(mean_over_repeats(rewards[rows]), mean_over_repeats(prices[rows]), pace, free)
+    return hindsight - here + float(np.mean(values))
 
 
 def _received(log: LoggedOutcomes, weights: RewardWeights, choices: Choices, name: str) -> dict[str, float]:

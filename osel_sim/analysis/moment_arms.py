@@ -1,18 +1,20 @@
 """Start selectors and monitors together: who is chosen at the beginning, who drives on, and what each instance comes to."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.engine import Setup, replay
+from osel_sim.analysis.engine import Part as Stream
+from osel_sim.analysis.engine import Setup, replay_parts
 from osel_sim.analysis.handovers import Handovers, outcomes, recovered_and_harmed, reward_of
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
 from osel_sim.analysis.moment_log import KEPT, MomentLog
 from osel_sim.analysis.told import told
 from osel_sim.analysis.warm_start import WarmStart
+from osel_sim.interface.selector import SelectorFactory
 from osel_sim.selection.reward import RewardWeights
 
 FIXED = "fixed:"
@@ -78,11 +80,13 @@ class Starts:
     Attributes:
         selectors: names, as a replay takes them; `NAME:warm` is shown the other half's episodes, driven with the same monitor.
         seeds: of random orders.
+        factories: selector -> what makes it, where it is none of the registry's.
     """
 
     selectors: Sequence[str]
     seeds: Sequence[int]
     workers: int = 1
+    factories: Mapping[str, SelectorFactory] = field(default_factory=dict)
 
     def fixed(self, log: MomentLog) -> dict[str, Array]:
         """`fixed:NAME` -> share (N, P)."""
@@ -93,8 +97,10 @@ class Starts:
         """Selector -> how often it chose each policy, (N, P), learning online from what the episodes came to with the monitor."""
         whole = as_episodes(log, handovers)
         here, others = whole.take(part.scored), whole.take(part.shown)
-        setup = Setup(weights, told(here, others, weights, self.selectors), WarmStart(others.contexts, others.rewards(weights)))
-        [choices] = replay(here, [setup], self.selectors, self.seeds, workers=self.workers)
+        named = [name for name in self.selectors if name not in self.factories]
+        setup = Setup(weights, told(here, others, weights, named), WarmStart(others.contexts, others.rewards(weights)))
+        parts = [Stream(here, [setup], self.selectors, self.seeds)]
+        [[choices]] = list(replay_parts(parts, self.workers, factories=self.factories))
         rows = np.flatnonzero(part.scored)
         shares = {name: np.zeros((len(log), len(log.policies))) for name in self.selectors}
         for name, share in shares.items():

@@ -21,6 +21,8 @@ from osel_sim.selection.reward import RewardWeights
 from osel_sim.statistics.paired import holm, sign_flip_midp
 
 NEVER = "never"
+FEWEST, SMALL = 10, 0.005
+"""A share of the gap to an oracle needs so many instances with repeats, and a gap that is larger."""
 BLIND = "blind"
 """Monitors that do not look; their duty is nobody's to match."""
 
@@ -175,7 +177,7 @@ def _oracles(log: MomentLog, found: Oracles, arms: Sequence[dict[str, Any]], val
 def _share(own: Array, base: Array, oracle: Array) -> float | None:
     """Share of the gap from the best single policy to an oracle; None where there is no gap to speak of."""
     gap = float(np.nanmean(oracle - base))
-    return float(np.nanmean(own - base)) / gap if gap > 0.005 else None
+    return float(np.nanmean(own - base)) / gap if gap > SMALL and len(oracle) >= FEWEST else None
 
 
 def _ratio(part: Array, whole: Array) -> float | None:

@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from typing import Any
 
 FIXED = "fixed:"
+FEWEST = 10
+"""Instances with repeats that a sentence about the oracles needs."""
 ERROR = 0.05
 """Of the tests of all monitors together that none gains anything (Holm)."""
 
@@ -71,8 +73,8 @@ def _equal(best: Mapping[str, Any]) -> list[str]:
 
 def _oracle(result: Mapping[str, Any]) -> list[str]:
     found = result["oracles"]
-    if found is None:
-        return ["No instance has repeats, so what could be gained at most is not known."]
+    if found is None or found["instances"] < FEWEST:
+        return ["Too few instances have repeats to say what could be gained at most."]
     gain, low, high = found["when_over_once"]
     return [
         f"The best schedule of each instance, chosen and scored on different repeats, comes to {found['when'][0]:.3f}; the best single choice at "

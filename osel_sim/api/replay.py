@@ -57,7 +57,6 @@ def replay(
     Raises:
         OselError: whatever is wrong with the settings or the log; the message says what.
     """
-    from osel_sim.api.replay_changes import check_all_outcomes
     from osel_sim.api.replay_moments import has_moments, replay_moments
     from osel_sim.interface.selector import factory_name
 
@@ -72,10 +71,7 @@ def replay(
         values["targets"] = targets
     config = log.changed(**values) if isinstance(log, ReplayConfig) else ReplayConfig.of(log=Path(log), **values)
     if has_moments(config.log):
-        check_all_outcomes(config, False)
-        if config.robots > 1:
-            raise SettingError("robots", f"{config.log} is a table of moments, of which monitors learn; leave the flag out")
-        return replay_moments(config)
+        return replay_moments(config, factories, functions)
     if config.monitors:
         raise SettingError("monitors", f"{config.log} holds no table of moments (record --moments makes one); leave the flag out")
     return _Replay(config, factories, functions, on_result).execute()
@@ -149,7 +145,7 @@ class _Replay:
         from osel_sim.api.replay_changes import changes_asked, replay_changes
         from osel_sim.api.robots import replay_robots
         from osel_sim.core.progress import progress
-        from osel_sim.formats.replay_result import FRONTIER, PENDING, SHARING, write_replay
+        from osel_sim.formats.replay_result import BUDGET, FRONTIER, PENDING, SHARING, write_replay
 
         config, seeds, robots = self.config, range(self.config.seeds), self._robots(selectors)
         check_budget(config, True)
@@ -179,7 +175,7 @@ class _Replay:
                 if plan is not None and part is plan.part:
                     result["frontier"] = plan.frontiers(made)
                 elif budgets is not None and part is budgets.part:
-                    result["budget"] = budgets.measured(made)
+                    result[BUDGET] = budgets.measured(made)
                 else:
                     chosen |= made[0].chosen
                     known = {name: chosen[name] for name in selectors if name in chosen}
@@ -191,6 +187,7 @@ class _Replay:
                     result["off_policy"] = off_policy
                     result |= _told(here)
                 pending = [name for name in selectors if name not in chosen]
+                pending += [BUDGET] if budgets is not None and BUDGET not in result else []
                 pending += [FRONTIER] if plan is not None and part is not plan.part else []
                 pending += [SHARING] if robots is not None else []
                 whole = {**result, PENDING: pending} if pending else result

@@ -1,6 +1,6 @@
 """A replay of a table of moments: start selectors and monitors compared on what would have come of every handover."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,14 +13,19 @@ if TYPE_CHECKING:
     from osel_sim.analysis.handovers import Handovers
     from osel_sim.analysis.moment_arms import Part
     from osel_sim.analysis.moment_log import MomentLog
+    from osel_sim.analysis.targets import Target
     from osel_sim.api.replay_settings import ReplayConfig
+    from osel_sim.interface.selector import SelectorFactory
     from osel_sim.selection.reward import RewardWeights
 
 SELECTORS = ("auto", "auto:warm")
 """Start selectors that are compared unless others are named."""
 MONITORS = ("stall", "disagreement", "value")
 """Monitors that are compared unless others are named."""
-_NOT_HERE = ("decisions", "unknown_costs", "unknown_skills", "no_frontier", "route_with", "targets", "context")
+_NOT_HERE = (
+    *("decisions", "unknown_costs", "unknown_skills", "no_frontier", "route_with", "targets", "context", "join", "leave", "drift"),
+    *("budget_cents", "budget_per", "robots", "share", "share_delay", "robots_by"),
+)
 """Settings of other replays."""
 
 
@@ -31,8 +36,14 @@ def has_moments(folder: Path) -> bool:
     return (folder / MOMENTS).is_file()
 
 
-def replay_moments(config: "ReplayConfig") -> MomentsResult:
+def replay_moments(
+    config: "ReplayConfig", factories: "Mapping[str, SelectorFactory] | None" = None, targets: "Mapping[str, Target] | None" = None
+) -> MomentsResult:
     """Compare monitors and start selectors on a table of moments. See `docs/moments.md`.
+
+    Args:
+        factories: start selectors of one's own, by the names that the settings have them by.
+        targets: must be none; they are of other replays.
 
     Raises:
         SettingError: a setting that goes with other replays only.
@@ -49,7 +60,10 @@ def replay_moments(config: "ReplayConfig") -> MomentsResult:
     for name in _NOT_HERE:
         if name in config.given:
             raise SettingError(name, f"{config.log} holds a table of moments, whose replay has no such setting; leave it out")
-    selectors = choose_selectors(config.selectors or SELECTORS, halved=True)
+    if targets:
+        raise SettingError("targets", f"{config.log} holds a table of moments: a target is estimated from a live run or from logged decisions")
+    own = dict(factories or {})
+    selectors = [*choose_selectors([name for name in config.selectors or SELECTORS if name not in own], halved=True), *own]
     check_replay_folder(config.folder, config.overwrite)
     log = read_moment_log(config.log, config.encoder)
     if config.policies:
@@ -57,12 +71,16 @@ def replay_moments(config: "ReplayConfig") -> MomentsResult:
     weights, preset = weights_of(config, log.whole.metadata)
     part = _part(log, config.half or "score")
     monitors, about = _monitors(log, weights, part, config.monitors or MONITORS)
-    starts = Starts(selectors, range(config.seeds), config.workers)
+    starts = Starts(selectors, range(config.seeds), config.workers, own)
     result = study(log, weights, monitors, Question(starts, part, config.margin))
     metadata = log.metadata
     result["log"] = {"folder": str(config.log), "encoder": log.whole.encoder, "half": config.half or "score", "preset": preset}
     result["log"] |= {"every": metadata["every"], "most": metadata["most"], "moments": int(log.there.sum()), "about": about}
     write_moments_result(config.folder, result, tables(result))
+    if config.open:
+        from osel_sim.api.report import report
+
+        report(config.folder, open=True)
     return MomentsResult(config.folder, result)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from osel_sim.api.robot_settings import RobotSettings
-from osel_sim.core.errors import UsageError
+from osel_sim.core.errors import SettingError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.engine import Setup
@@ -25,6 +25,7 @@ def sharing_asked(config: RobotSettings) -> "Sharing | None":
 
     Raises:
         UsageError: something is said of several robots and there is one, or `share` is none of what it may be.
+        SettingError: they are to keep to a budget.
     """
     from osel_sim.selection.fleet import Sharing
 
@@ -33,6 +34,8 @@ def sharing_asked(config: RobotSettings) -> "Sharing | None":
             if getattr(config, name):
                 raise UsageError(f"--{name.replace('_', '-')} is for several robots; say how many with --robots")
         return None
+    if getattr(config, "budget_cents", None) is not None:
+        raise SettingError("budget_cents", "is for one robot: leave it out, or --robots")
     return Sharing.parse(config.share or SHARE, config.share_delay)
 
 

@@ -128,7 +128,7 @@ class _Run:
         self._check_selector()
         self.budget = budget_of(config, self.tasks, [*self.policies, *self.plan.joined.values()])
         self.sharing = check_robots(config, self.tasks, named=self.factory is None)
-        check_monitor(config, monitor, self.policies)
+        check_monitor(config, monitor, self.policies, changing=bool(self.plan.changes))
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
@@ -309,12 +309,14 @@ class _Run:
     def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
         from osel_sim.api.run_monitor import make_run_monitor
         from osel_sim.episodes.live import LiveOptions, LiveRun
+        from osel_sim.formats.merged_policy import MERGE
 
         config = self.config
         options = LiveOptions(
             *(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context),
             changes=self._changes(encoder, selector),
-            prices={spec.name: spec.price for spec in (*self.policies, *self.plan.joined.values())},
+            # What a merge costs depends on whose answers there were.
+            prices={spec.name: spec.price for spec in (*self.policies, *self.plan.joined.values()) if spec.kind != MERGE},
         )
         options = replace(options, robots=config.robots, robots_by=config.robots_by)
         monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
@@ -333,8 +335,7 @@ class _Run:
         films = [Films(folder, config.filmed, "full" if config.video else "fast")] if config.filmed else []
         wanted = [make() for asked, make in ((config.realtime, Paced), (config.tensorboard, TensorBoard), (config.view, View)) if asked]
         if self.spending is not None:
-            graded = "subgoals" if self.weights.success == "subgoals" else "success"
-            self.spent = BudgetFile(self.spending, graded, config.episodes)
+            self.spent = BudgetFile(self.spending, "subgoals" if self.weights.success == "subgoals" else "success", config.episodes)
         spent = [self.spent] if self.spent is not None else []
         return [TimingFile(), WarningFile(), *films, *wanted, *spent, *self.watchers, Progress(config.episodes), *([self.page] if self.page else [])]
 

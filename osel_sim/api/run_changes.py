@@ -74,12 +74,10 @@ def plan(config: "RunConfig", initial: "Sequence[PolicySpec]", environment: "Env
     names, file = [spec.name for spec in initial], config.folder / JOURNAL
     made = read_changes(config.folder, names)
     decisions = file.read_bytes().count(b"\n") if file.is_file() else 0
-    for flag, choosing in (("--monitor", config.monitor is not None), ("--robots", config.robots > 1)):
-        if choosing and (config.add_policies or config.retire):
+    for flag, fixed in (("--monitor", config.monitor is not None), ("--robots", config.robots > 1)):
+        if fixed and (config.add_policies or config.retire):
             raise UsageError(f"policies of a run with {flag} do not come and go; begin a new run with the policies that there are now")
     asked = _asked(config, names, made, decisions, environment, objects)
-    if asked and config.monitor is not None:
-        raise UsageError(f"a monitor ({config.monitor}) hands over among the policies that the run began with: begin a new run with other ones")
     if asked and made and made[-1].before > decisions:
         raise UsageError(f"{config.folder / EVENTS}: {made[-1].words}, {JOURNAL} beside it has {decisions}: {LOST}; --resume alone makes them again")
     if asked and decisions >= config.episodes:

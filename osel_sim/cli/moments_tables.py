@@ -12,31 +12,49 @@ def print_moments(console: Console, result: Mapping[str, Any]) -> None:
     """Print start selectors with monitors, what switching without looking comes to at their duty, the oracles, and the verdict."""
     calls = ", ".join(map(str, result["calls"]))
     title = f"{result['instances']} instances, learned from {result['learned_from']} others; decision points before calls {calls}"
-    headings = ("mean reward [95%]", "gain [95%]", "p (Holm)", "success", "cents", "seconds", "duty", "recovered", "harmed", "of the gap")
-    table = Table(title, ("at the start", "monitor"), headings)
-    for arm in sorted(result["arms"], key=lambda arm: -arm["reward"][0]):
-        table.add(
-            arm["start"],
-            arm["monitor"],
-            _interval(arm["reward"]),
-            _interval(arm.get("gain")),
-            "-" if arm.get("p_reward_holm") is None else f"{arm['p_reward_holm']:.2g}",
-            percent(arm["success"][0]),
-            number(arm["price"][0]),
-            number(arm["seconds"][0]),
-            percent(arm["duty"]),
-            *(percent(arm[name]) for name in ("recovered", "harmed", "of_gap")),
-        )
+    headings = ("reward", "gain [95%]", "p (Holm)", "success", "cents", "duty", "recovered", "harmed", "of the gap")
+    table, idle = Table(title, ("at the start", "monitor"), headings), dict[str, list[str]]()
+    starts = sorted(dict.fromkeys(arm["start"] for arm in result["arms"]), key=lambda start: -_alone(result, start)["reward"][0])
+    for start in starts:
+        own = [arm for arm in result["arms"] if arm["start"] == start]
+        idle[start] = [arm["monitor"] for arm in own if _does_nothing(arm, _alone(result, start))]
+        for arm in sorted((arm for arm in own if arm["monitor"] not in idle[start]), key=lambda arm: -arm["reward"][0]):
+            table.add(
+                start.removeprefix("fixed:"),
+                arm["monitor"],
+                number(arm["reward"][0], 3),
+                _interval(arm.get("gain")),
+                "-" if arm.get("p_reward_holm") is None else f"{arm['p_reward_holm']:.2g}",
+                *_numbers(arm),
+                percent(arm.get("of_gap")),
+            )
+        table.add_section()
     console.print(table)
     verdict = result["verdict"]
     best = next((arm for arm in result["arms"] if (arm["start"], arm["monitor"]) == (verdict["start"], verdict["monitor"])), None)
     if best is not None and best.get("equal_duty"):
         console.print(_equal_duty(best, best["equal_duty"]))
-    for sentence in _notes(result):
+    for sentence in [*_notes(result), *_idle(idle)]:
         console.print(plain(sentence), soft_wrap=True)
     console.print(plain(verdict["headline"], "bold"), soft_wrap=True)
     for sentence in verdict["sentences"]:
         console.print(plain(sentence), soft_wrap=True)
+
+
+def _alone(result: Mapping[str, Any], start: str) -> Mapping[str, Any]:
+    return next(arm for arm in result["arms"] if (arm["start"], arm["monitor"]) == (start, "never"))
+
+
+def _does_nothing(arm: Mapping[str, Any], alone: Mapping[str, Any]) -> bool:
+    return arm is not alone and arm["reward"] == alone["reward"] and arm["duty"] == alone["duty"]
+
+
+def _idle(idle: Mapping[str, Sequence[str]]) -> list[str]:
+    """Which monitors handed nothing over, where there are some."""
+    after = dict[str, list[str]]()
+    for start, names in idle.items():
+        after.setdefault("; ".join(names), []).append(start.removeprefix("fixed:"))
+    return [f"nothing is handed over by {names} after {', '.join(starts)}" for names, starts in after.items() if names]
 
 
 def _equal_duty(best: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> Table:

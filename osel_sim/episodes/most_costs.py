@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from osel_sim.formats.merged_policy import parts_of
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
 
@@ -24,10 +25,15 @@ def most_costs(policies: Sequence[PolicySpec], everyone: Sequence[PolicySpec], h
 
 
 def _alone(spec: PolicySpec, horizon: int, environment: EnvironmentSpec) -> float:
+    """Of a merge all parts are asked and paid, at every call of it."""
     calls = math.ceil(horizon / spec.execute)
+    return sum(part.price.of(horizon, calls, calls * _megabytes(part, horizon, environment)) for part in parts_of(spec))
+
+
+def _megabytes(spec: PolicySpec, horizon: int, environment: EnvironmentSpec) -> float:
+    """What a call moves, at most."""
     images = len(spec.cameras) * 3 * spec.image_size**2 * spec.history
-    megabytes = 1e-6 * (images + 8 * environment.action.dimension * max(spec.execute, horizon) + OVERHEAD) if spec.is_remote else 0.0
-    return spec.price.of(horizon, calls, calls * megabytes)
+    return 1e-6 * (images + 8 * environment.action.dimension * max(spec.execute, horizon) + OVERHEAD) if spec.is_remote else 0.0
 
 
 def _fallback(spec: PolicySpec, named: Mapping[str, PolicySpec], horizon: int, environment: EnvironmentSpec) -> float:

@@ -150,7 +150,7 @@ def check_policy(spec: PolicySpec, task: Task, seed: int, level: int, out: Path,
             env.close()
     out.mkdir(parents=True, exist_ok=True)
     report.calls = len(watched.seen)
-    report.outcome = asdict(outcome)
+    report.outcome = {key: value for key, value in asdict(outcome).items() if key != "monitored"}
     if watched.seen:
         seen = [split(observation)[-1] for observation, _ in watched.seen]
         _inputs(report, spec, environment, seen[0])

@@ -28,8 +28,8 @@ READABLE = (1, 2, CHANGING_VERSION)
 CHANGES = "changes"
 OFF_POLICY_VERSION = 1
 REPLAY, CHOICES, OFF_POLICY = "replay.json", "choices.npz", "off_policy.json"
-PENDING, FRONTIER, SHARING = "pending", "frontier", "sharing"
-"""Key of `replay.json` while not all is replayed: names of the selectors that are missing, and `frontier` and `sharing` where those are."""
+PENDING, FRONTIER, SHARING, BUDGET = "pending", "frontier", "sharing", "budget"
+"""Key of `replay.json` while not all is replayed: names of the selectors that are missing, and `budget`, `frontier` and `sharing` where those are."""
 _PREFIX = "choice."
 
 

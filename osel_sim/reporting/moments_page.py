@@ -17,6 +17,8 @@ from osel_sim.reporting.page import Block, Page, Section, Tile, Verdict
 from osel_sim.reporting.palette import LIGHT, colours
 
 _TONES: dict[str, Literal["good", "neutral", "bad"]] = {"hand_over": "good", "do_not": "neutral", "unknown": "neutral"}
+FEWEST = 3
+"""Instances that a point of these curves needs."""
 MOST_TASKS = 12
 """Panels of the curves of gains; `gains.csv` has all."""
 
@@ -121,7 +123,7 @@ def _gains(result: Mapping[str, Any]) -> list[Block]:
 
 
 def _line(pair: str, own: Sequence[Mapping[str, Any]], result: Mapping[str, Any]) -> Line:
-    at = {gain["call"]: gain["gain"] for gain in own}
+    at = {gain["call"]: gain["gain"] for gain in own if gain["moments"] >= FEWEST}
     y, low, high = (np.array([at[call][end] if call in at else np.nan for call in result["calls"]], np.float64) for end in ("value", "low", "high"))
     return Line(pair, y, low, high)
 
@@ -189,9 +191,13 @@ def _equal_duty(result: Mapping[str, Any]) -> list[Block]:
 
 def _duty(result: Mapping[str, Any]) -> Figure:
     starts = list(dict.fromkeys(arm["start"] for arm in result["arms"]))
-    dots = [Dot(arm["start"], certain(100 * arm["duty"]), _percent(arm["success"]), arm["monitor"]) for arm in result["arms"]]
-    told = [f"{arm['start']} with {arm['monitor']} {100 * arm['success'][0]:.0f}% at {100 * arm['duty']:.0f}%" for arm in result["arms"]]
-    caption = "Each dot is a start selector with a monitor. Up and to the left is better: more success with fewer steps of remote policies."
+    arms = [arm for arm in result["arms"] if arm["monitor"] == "never" or arm["gain"] != [0.0, 0.0, 0.0]]
+    dots = [Dot(arm["start"], certain(100 * arm["duty"]), _percent(arm["success"]), arm["monitor"]) for arm in arms]
+    told = [f"{arm['start']} with {arm['monitor']} {100 * arm['success'][0]:.0f}% at {100 * arm['duty']:.0f}%" for arm in arms]
+    caption = (
+        "Each dot is a start selector with a monitor that hands something over, or with none. Up and to the left is better: more success with fewer "
+        "steps of remote policies."
+    )
     return Figure(
         "duty",
         "Duty against success",

@@ -74,7 +74,7 @@ def number(text: str, parameter: str, low: float, high: float = float("inf"), wh
     """
     try:
         value = float(int(text) if whole else text)
-    except ValueError:
+    except (ValueError, OverflowError):
         value = float("nan")
     if not (low <= value <= high and value < float("inf")):
         kind = "an integer" if whole else "a number"

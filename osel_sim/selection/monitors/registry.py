@@ -70,7 +70,10 @@ def make_monitor(name: str, candidates: "Sequence[Candidate]", picture_dim: int,
     factory = MONITORS.load(kind)
     try:
         inspect.signature(factory).bind(candidates, picture_dim, seed, *parameters)
+        fits = "" not in parameters
     except TypeError:
+        fits = False
+    if not fits:
         form = FORMS.get(kind, kind if kind in BUILT_IN else f"{kind} with other parameters")
-        raise UsageError(f"monitor {name!r}: write {form}") from None
+        raise UsageError(f"monitor {name!r}: write {form}")
     return cast("Monitor", factory(candidates, picture_dim, seed, *parameters))
