@@ -215,3 +215,10 @@ def test_settings_of_other_replays_are_refused(folder: Path, replayed: Path, tmp
         replay(folder, decisions=10, out=tmp_path / "new")
     with pytest.raises(OselError, match="holds a replay"):
         replay(folder, out=replayed)
+
+
+def test_the_shipped_table_is_of_its_log() -> None:
+    log = read_moment_log(Path(__file__).parent.parent / "assets" / "logs" / "moments")
+    assert log.policies == ("local_small", "remote_large", "remote_specialist") and log.calls == (6, 12, 18)
+    assert log.remote.tolist() == [False, True, True]
+    assert np.isfinite(log.ways["success"][log.there]).all()
