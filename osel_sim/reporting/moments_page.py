@@ -98,7 +98,7 @@ def _timeline(result: Mapping[str, Any]) -> Figure:
 
 def _gains(result: Mapping[str, Any]) -> list[Block]:
     """A panel for all tasks together and each task: gain over the moment of handing over, a line for each pair."""
-    gains = result["gains"]
+    gains = [gain for gain in result["gains"] if gain["moments"] >= FEWEST]
     tasks = list(dict.fromkeys(gain["task"] for gain in gains))
     pairs = list(dict.fromkeys(f"{gain['first']} to {gain['second']}" for gain in gains))
     if len(result["calls"]) < 2 or not gains:
@@ -109,7 +109,7 @@ def _gains(result: Mapping[str, Any]) -> list[Block]:
             _line(pair, [gain for gain in gains if gain["task"] == task and f"{gain['first']} to {gain['second']}" == pair], result) for pair in pairs
         ]
         panels.append(curves(task, result["calls"], lines, look, ("calls before the handover", "gain in reward")))
-    best = max(gains, key=lambda gain: float(gain["gain"]["value"]) if gain["task"] != "all" and gain["moments"] >= 5 else -9.0)
+    best = max(gains, key=lambda gain: float(gain["gain"]["value"]) if gain["task"] != "all" else -9.0)
     return [
         Figure(
             "gains",
@@ -123,7 +123,7 @@ def _gains(result: Mapping[str, Any]) -> list[Block]:
 
 
 def _line(pair: str, own: Sequence[Mapping[str, Any]], result: Mapping[str, Any]) -> Line:
-    at = {gain["call"]: gain["gain"] for gain in own if gain["moments"] >= FEWEST}
+    at = {gain["call"]: gain["gain"] for gain in own}
     y, low, high = (np.array([at[call][end] if call in at else np.nan for call in result["calls"]], np.float64) for end in ("value", "low", "high"))
     return Line(pair, y, low, high)
 
