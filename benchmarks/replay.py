@@ -25,7 +25,8 @@ from typing import Any
 
 import numpy as np
 
-from osel_sim.analysis.engine import one_thread, replay_one
+from osel_sim.analysis.engine import replay_one
+from osel_sim.analysis.one_thread import one_thread
 
 POLICIES = ("local", "remote")
 PARTS = ("ppo", "bound", "auto", "whole")

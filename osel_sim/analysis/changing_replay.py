@@ -4,8 +4,7 @@ Each selector goes through every stream in three ways: `through` all of its chan
 as one that `knew`: it had the policies and prices of after the change from the first decision on, so that it has learned them when the change comes.
 """
 
-import os
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -13,15 +12,14 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from osel_sim.analysis.engine import WARM, Setup
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
+from osel_sim.analysis.one_thread import played
 from osel_sim.analysis.stream_changes import Span, Timeline
 from osel_sim.analysis.streams import Streams, draw_streams
 from osel_sim.analysis.warm_start import WarmStart, show
-from osel_sim.core.errors import UsageError, WorkerError
-from osel_sim.core.processes import Lost, Work, run_jobs
+from osel_sim.core.errors import UsageError
 from osel_sim.core.torch_settings import threads_where_imported
 from osel_sim.interface.selector import Selector, SelectorFactory
 from osel_sim.selection.changing import changing
@@ -123,7 +121,7 @@ def replay_changing(
     ]
     shape = material.streams.order.shape
     found: dict[str, dict[Way, NDArray[np.int16]]] = {name: {way: np.full(shape, NOBODY, np.int16) for way in WAYS} for name in selectors}
-    with closing(_run(material, factories or {}, jobs, workers, lambda: progress(0))) as results:
+    with closing(played(partial(_replay_job, material, factories or {}), jobs, workers, lambda: progress(0))) as results:
         for (name, way, number, seed), columns in results:
             span = material.timeline.spans[number]
             where = slice(None) if way == "through" else span.decisions
@@ -214,7 +212,7 @@ def _pieces(material: ChangingLog, way: Way, number: int, seed: int) -> list[Pie
     return [Piece(contexts[where], material.rewards(seed, span)[where], span.columns) for span, where in parts]
 
 
-def _replay_job(material: ChangingLog, factories: Mapping[str, SelectorFactory], job: _Job) -> tuple[_Job, NDArray[np.int16]]:
+def _replay_job(material: ChangingLog, factories: Mapping[str, SelectorFactory], job: _Job) -> NDArray[np.int16]:
     from osel_sim.selection.registry import make_selector
 
     name, way, number, seed = job
@@ -226,27 +224,4 @@ def _replay_job(material: ChangingLog, factories: Mapping[str, SelectorFactory],
     with threads_where_imported(1):  # by now a selector that needs torch has imported it
         if name.endswith(WARM) and setup.warm_start is not None:
             show(selector, WarmStart(setup.warm_start.contexts, setup.warm_start.rewards[:, columns]), own, random)
-        return job, play(selector, pieces, policies)
-
-
-def _run(
-    material: ChangingLog, factories: Mapping[str, SelectorFactory], jobs: Sequence[_Job], workers: int, ready: Callable[[], None]
-) -> Generator[tuple[_Job, NDArray[np.int16]]]:
-    if workers == 1:
-        ready()
-        for job in jobs:
-            with threadpool_limits(1):  # the last bits of numpy's matrix products depend on the number of threads
-                result = _replay_job(material, factories, job)
-            yield result
-        return
-    with closing(run_jobs(partial(_replayer, material, factories), jobs, workers, ready=ready)) as events:
-        for event in events:
-            if isinstance(event, Lost):
-                raise event.error or WorkerError(f"a worker process of the replay died twice ({event.cause}; out of memory?); try --workers 1")
-            yield event.value
-
-
-def _replayer(material: ChangingLog, factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
-    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-    threadpool_limits(1)
-    return lambda job, _: [_replay_job(material, factories, job)]
+        return play(selector, pieces, policies)

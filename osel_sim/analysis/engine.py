@@ -1,24 +1,22 @@
 """Replays of selectors over streams of a log, in processes; the result does not depend on how many."""
 
-import os
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from osel_sim.analysis.log import LoggedOutcomes
+from osel_sim.analysis.one_thread import played
 from osel_sim.analysis.streams import Streams, draw_streams
 from osel_sim.analysis.warm_start import WarmStart, show
 from osel_sim.analysis.within_budget import Within
-from osel_sim.core.errors import UsageError, WorkerError
-from osel_sim.core.processes import Lost, Work, run_jobs
-from osel_sim.core.torch_settings import threads, threads_where_imported
+from osel_sim.core.errors import UsageError
+from osel_sim.core.torch_settings import threads_where_imported
 from osel_sim.formats.replay_result import Choices
 from osel_sim.interface.selector import Selector, SelectorFactory
 from osel_sim.selection.budget import Budget
@@ -147,7 +145,7 @@ def _collected(
         for part, material in zip(parts, materials, strict=True)
     ]
     missing = Counter(number for number, *_ in jobs)
-    with closing(_run(materials, factories, jobs, workers, lambda: count(0))) as results:
+    with closing(played(partial(_replay_job, materials, factories), jobs, workers, lambda: count(0))) as results:
         for number, part in enumerate(parts):
             while missing[number]:
                 (of, at, name, seed), columns = next(results)
@@ -217,38 +215,7 @@ def _slowness(name: str) -> int:
     return SLOW_FIRST.index(name) if name in SLOW_FIRST else len(SLOW_FIRST)
 
 
-def _run(
-    materials: Sequence[_Material], factories: Mapping[str, SelectorFactory], jobs: Sequence[_Job], workers: int, ready: Callable[[], None]
-) -> Generator[tuple[_Job, NDArray[np.int16]]]:
-    if workers == 1:
-        ready()
-        for job in jobs:
-            # The last bits of numpy's matrix products depend on the number of threads. Not around all jobs: what is made of a part in between is not
-            # part of it.
-            with threadpool_limits(1):
-                result = _replay_job(materials, factories, job)
-            yield result
-        return
-    with closing(run_jobs(partial(_replayer, materials, factories), jobs, workers, ready=ready)) as events:
-        for event in events:
-            if isinstance(event, Lost):
-                raise event.error or WorkerError(f"a worker process of the replay died twice ({event.cause}; out of memory?); try --workers 1")
-            yield event.value
-
-
-def one_thread_worker() -> None:
-    """Compute on one thread in this worker from now on."""
-    os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
-    threadpool_limits(1)
-
-
-def _replayer(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory]) -> Work[_Job, tuple[_Job, NDArray[np.int16]]]:
-    """What a worker does. What it loads later, such as torch, which takes seconds and not all need, heeds the environment."""
-    one_thread_worker()
-    return lambda job, _: [_replay_job(materials, factories, job)]
-
-
-def _replay_job(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory], job: _Job) -> tuple[_Job, NDArray[np.int16]]:
+def _replay_job(materials: Sequence[_Material], factories: Mapping[str, SelectorFactory], job: _Job) -> NDArray[np.int16]:
     part, at, name, number = job
     material = materials[part]
     setup, streams = material.setups[at], material.streams[at]
@@ -260,11 +227,4 @@ def _replay_job(materials: Sequence[_Material], factories: Mapping[str, Selector
     within = None
     if setup.budget is not None and material.prices is not None:
         within = Within(setup.budget, streams.rewards(material.prices, number))
-    return job, replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, within, **setup.settings.get(name, {}))
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One thread for matrix products, torch's too, which this imports: their last bits depend on the number, and workers share the cores anyway."""
-    with threadpool_limits(1), threads(1):
-        yield
+    return replay_one(kind, contexts, rewards, material.policies, seed, shown, factory, within, **setup.settings.get(name, {}))

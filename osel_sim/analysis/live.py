@@ -86,13 +86,18 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
     instances = named_robots(
         LoggedInstance(decision.instance, **{name: getattr(decision, name) for name in ABOUT if name != "axes"}) for decision in decisions
     )
-    rows = [_row(decision, decision.policy, decision.outcome) for decision in decisions]
+    own = [decision.outcome for decision in decisions]
+    rows: list[Row] = []
     for decision, (data, _) in zip(decisions, read_lines(folder / COUNTERFACTUAL), strict=False):  # a killed run may have one line more
         there = available(initial, changes, decision.index)
         others = to_others(data, decision.index, folder / COUNTERFACTUAL, there, decision.policy)
         for policy, outcome in others.outcomes.items():
             check_reward(others.rewards[policy], outcome, weights, f"{folder / COUNTERFACTUAL}, line {decision.index + 1}: {policy}")
             rows.append(_row(decision, policy, outcome))
+        if others.alone is not None:  # what a monitor made of it is not the policy's own, which the others are compared with
+            check_reward(others.alone_reward, others.alone, weights, f"{folder / COUNTERFACTUAL}, line {decision.index + 1}: alone")
+            own[decision.index] = others.alone
+    rows += [_row(decision, decision.policy, outcome) for decision, outcome in zip(decisions, own, strict=True)]
     if (folder / COUNTERFACTUAL).exists() or configuration.get("counterfactual") is True:
         check_beside(folder / COUNTERFACTUAL, len(journal), complete=True)
     keys = [instance.key for instance in instances]

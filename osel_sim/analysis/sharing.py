@@ -1,6 +1,6 @@
 """A log replayed to several robots at once: what sharing is worth, against each alone and against one that sees everything."""
 
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.engine import WARM, Setup, one_thread, one_thread_worker
+from osel_sim.analysis.engine import WARM, Setup
 from osel_sim.analysis.log import LoggedOutcomes
+from osel_sim.analysis.one_thread import played
 from osel_sim.analysis.streams import Streams, draw_streams
 from osel_sim.analysis.warm_start import show
-from osel_sim.core.errors import WorkerError
-from osel_sim.core.processes import Lost, Work, run_jobs
+from osel_sim.core.torch_settings import threads_where_imported
 from osel_sim.interface.selector import Selector, SelectorFactory
 from osel_sim.selection.dealing import By, deal, groups
 from osel_sim.selection.fleet import Fleet, Sharing, robot_seed
@@ -106,10 +106,10 @@ def share_log(
     cut = tuple(own[:rounds] for own in places)
     material = _Material(log.contexts, rewards, log.policies, streams, tuple(seeds), cut, setup, robots, factories or {})
     jobs = [(name, way, seed) for name in selectors for way in robots.ways for seed in range(len(seeds))]
-    played: dict[_Job, _Played] = {}
-    with closing(_run(material, jobs, workers)) as results:
+    found: dict[_Job, _Played] = {}
+    with closing(played(partial(_play, material), jobs, workers)) as results:
         for job, one in results:
-            played[job] = one
+            found[job] = one
             count(one[0].size)
     return {
         "robots": robots.count,
@@ -118,7 +118,7 @@ def share_log(
         "delay": robots.sharing.delay,
         "decisions": rounds,
         "at": (_thinned(rounds) + 1).tolist(),
-        "selectors": {name: _entry(name, robots, played, len(seeds)) for name in selectors},
+        "selectors": {name: _entry(name, robots, found, len(seeds)) for name in selectors},
     }
 
 
@@ -127,9 +127,9 @@ def share_total(robots: Robots, selectors: Sequence[str], seeds: int, decisions:
     return len(robots.ways) * len(selectors) * seeds * decisions
 
 
-def _entry(name: str, robots: Robots, played: Mapping[_Job, _Played], seeds: int) -> dict[str, Any]:
+def _entry(name: str, robots: Robots, found: Mapping[_Job, _Played], seeds: int) -> dict[str, Any]:
     """What a selector came to, by way to share."""
-    tables = {way: np.stack([played[name, way, seed][0] for seed in range(seeds)]) for way in robots.ways}
+    tables = {way: np.stack([found[name, way, seed][0] for seed in range(seeds)]) for way in robots.ways}
     means = {way: table.mean(axis=(1, 2)) for way, table in tables.items()}
     share = str(robots.sharing)
     closed, ends, gain = _closed(means["none"], means[share], means["all"])
@@ -139,7 +139,7 @@ def _entry(name: str, robots: Robots, played: Mapping[_Job, _Played], seeds: int
         "gain_ci95": gain[1],
         "gap_closed": closed,
         "gap_closed_ci95": ends,
-        "message_bytes": float(np.mean([played[name, share, seed][1] for seed in range(seeds)])),
+        "message_bytes": float(np.mean([found[name, share, seed][1] for seed in range(seeds)])),
     }
 
 
@@ -178,31 +178,19 @@ def _thinned(rounds: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, rounds - 1, min(POINTS, rounds)).round().astype(np.int64))
 
 
-def _run(material: _Material, jobs: Sequence[_Job], workers: int) -> Generator[tuple[_Job, _Played]]:
-    if workers == 1:
-        for job in jobs:
-            with one_thread():
-                played = _play(material, job)
-            yield job, played
-        return
-    with closing(run_jobs(partial(_player, material), jobs, workers)) as events:
-        for event in events:
-            if isinstance(event, Lost):
-                raise event.error or WorkerError(f"a worker process of the replay died twice ({event.cause}; out of memory?); try --workers 1")
-            yield event.job, event.value
-
-
-def _player(material: _Material) -> Work[_Job, _Played]:
-    one_thread_worker()
-    return lambda job, _: [_play(material, job)]
-
-
 def _play(material: _Material, job: _Job) -> _Played:
     """Show its stream to the robots of one seed, each of which sees the rewards of its choices only."""
     name, way, number = job
-    robots, streams = material.robots, material.streams
+    robots = material.robots
     fleet = Fleet(partial(_selector, material, name, number), robots.count, robots.ways[way])
     fleet.begin()
+    with threads_where_imported(1):  # by now selectors that need torch have imported it
+        return _through(fleet, material, number)
+
+
+def _through(fleet: Fleet, material: _Material, number: int) -> _Played:
+    """Show the stream of one seed to its robots."""
+    streams = material.streams
     rewards = streams.rewards(material.rewards, number)
     contexts = material.contexts[streams.order[number]]
     contexts.flags.writeable = False
