@@ -333,7 +333,7 @@ def test_error_rows_that_say_something_of_a_policy_are_kept_by_a_resume(world, r
 
 def test_axes_are_recorded_and_change_what_the_policies_see(world, reference):
     folder = world / "perturbed"
-    flags = ("--repeats", 1, "--level", 1, "--axis", "camera=3", "--axis", "light=1", "--workers", 1)
+    flags = ("--policies", "calm", "--repeats", 1, "--level", 1, "--axis", "camera=3", "--axis", "light=1", "--workers", 1)
     assert record(world, *SIZE, *flags, "--out", folder) == 0
     rows, metadata = read_rollouts(folder)
     assert {(row.level, row.axes) for row in rows} == {(1, "camera=3")}

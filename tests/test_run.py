@@ -1,5 +1,7 @@
 """`python -m osel_sim.run` as a user meets it: real processes, a real policy server, and a run that is killed."""
 
+import contextlib
+import io
 import json
 import os
 import random
@@ -35,11 +37,11 @@ def world(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def reference(world):
-    """A run that nobody disturbed."""
+    """A run that nobody disturbed: folder, output, messages."""
     folder = world / "reference"
-    done = execute(world, "run", "--episodes", EPISODES, "--counterfactual", "--out", folder)
-    assert done.returncode == 0, done.stderr
-    return folder, done
+    with contextlib.redirect_stdout(io.StringIO()) as output, contextlib.redirect_stderr(io.StringIO()) as messages:
+        assert user(world, "--episodes", EPISODES, "--counterfactual", "--out", folder) == 0
+    return folder, output.getvalue(), messages.getvalue()
 
 
 def bytes_of(folder: Path) -> dict[str, bytes]:
@@ -48,15 +50,15 @@ def bytes_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_what_a_run_writes_and_prints(world, reference):
-    folder, done = reference
+    folder, output, messages = reference
     files = "contexts.npz counterfactual.jsonl curve.png episodes.jsonl run.json selector.safetensors summary.json timing.jsonl"
     page = "figures report.html tables"
     assert sorted(file.name for file in folder.iterdir()) == sorted(f"{files} {page}".split())
-    assert "mean reward" in done.stdout
-    assert "hindsight oracle" in done.stdout
-    assert "--selector auto" in done.stdout
-    assert [name for name, _ in next_commands(done.stdout)] == ["report", "replay", "run"]
-    assert "Traceback" not in done.stderr
+    assert "mean reward" in output
+    assert "hindsight oracle" in output
+    assert "--selector auto" in output
+    assert [name for name, _ in next_commands(output)] == ["report", "replay", "run"]
+    assert "Traceback" not in messages
     decisions = read_journal(folder / "episodes.jsonl")
     assert [decision.seed for decision in decisions] == list(range(EPISODES))
     assert all(decision.error is None and decision.steps == HORIZON for decision in decisions)
@@ -69,7 +71,7 @@ def test_what_a_run_writes_and_prints(world, reference):
 
 
 def test_summary_agrees_with_the_journal(reference):
-    folder, _ = reference
+    folder, *_ = reference
     summary = json.loads((folder / "summary.json").read_text())
     decisions = read_journal(folder / "episodes.jsonl")
     others = [json.loads(line)["policies"] for line in (folder / "counterfactual.jsonl").read_text().splitlines()]
@@ -89,7 +91,7 @@ def test_summary_agrees_with_the_journal(reference):
 
 
 def test_run_json_holds_what_the_run_depends_on(reference):
-    folder, _ = reference
+    folder, *_ = reference
     found = json.loads((folder / "run.json").read_text())
     assert found["configuration"]["reward"] == {"alpha_time": 0.2, "alpha_price": 0.01, "time_unit": "log10-seconds", "success": "success"}
     assert set(found["configuration"]["content"]) == {"task short", "policy calm", "policy wild"}
@@ -195,7 +197,7 @@ def test_ctrl_c_ends_with_what_there_is(world):
 
 
 def test_a_resumed_run_must_be_the_same_run(world, reference, capsys):
-    folder, _ = reference
+    folder, *_ = reference
     for flags, key in (
         (["--seed", "1"], "seed"),
         (["--alpha-price", "1"], "reward.alpha_price"),

@@ -3,18 +3,25 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 from safetensors import safe_open
 
 from osel_sim.core import content
+from osel_sim.episodes.drivers import choose_policies
 from osel_sim.episodes.loop import Driver, run_episode
 from osel_sim.formats import library
+from osel_sim.interface.specification import specification
 from osel_sim.policy.local import LocalCaller
 from osel_sim.policy.registry import make_policy
 from osel_sim.sim.env import TaskEnv
 from osel_sim.sim.instance import make_instance
+from osel_sim.suites.environments import environment
+from osel_sim.suites.metaworld.tasks import SPECIFICATION
+from osel_sim.suites.registry import find_task
 
-POLICIES = ("local_small", "remote_base", "remote_large", "remote_specialist")
+METAWORLD = ("metaworld_small", "metaworld_large")
+POLICIES = ("local_small", "remote_base", "remote_large", "remote_specialist", *METAWORLD)
 INSTANCES = 12
 
 
@@ -42,6 +49,37 @@ def test_solves_unseen_instances(name, task, at_least):
             break
     env.close()
     assert solved == at_least
+
+
+@pytest.mark.parametrize("name", METAWORLD)
+def test_drives_meta_worlds_environment(name):
+    spec = dataclasses.replace(library.load_policy(name), remote=None)
+    policy = make_policy(spec, SPECIFICATION)
+    policy.reset("open the drawer")
+    images = {f"observation.images.{camera}": np.zeros((spec.image_size, spec.image_size, 3), np.uint8) for camera in spec.cameras}
+    actions = policy.act({**images, "observation.state": np.zeros(4, np.float32), "task": "open the drawer"})
+    assert len(actions) >= spec.execute and actions.shape[1] == 4 and np.abs(actions).max() <= 1.0
+
+
+def test_each_world_is_offered_its_own_policies():
+    assert [spec.name for spec in choose_policies(None, SPECIFICATION)] == sorted(METAWORLD)
+    assert not {spec.name for spec in choose_policies(None, specification())} & set(METAWORLD)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not environment("metaworld").installed, reason="the suite's environment has not been made")
+@pytest.mark.parametrize("name", METAWORLD)
+def test_solves_unseen_instances_of_meta_world(name):
+    task = find_task("metaworld:drawer-open-v3")
+    env, spec = task.open(), dataclasses.replace(library.load_policy(name), remote=None)
+    driver = Driver(spec, LocalCaller(make_policy(spec, env.specification), spec, env.specification))
+    outcomes = []
+    for seed in range(4):
+        instance = task.instance(seed)
+        env.load(instance)
+        outcomes.append(run_episode(env, instance, driver))
+    env.close()
+    assert [outcome.error for outcome in outcomes] == [None] * 4 and sum(outcome.success for outcome in outcomes) >= 2
 
 
 @pytest.mark.parametrize("name", POLICIES)

@@ -268,12 +268,25 @@ def test_demonstrations_of_the_expert(tmp_path):
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     out = tmp_path / "data"
-    (collected,) = osel_sim.collect(task=("metaworld:drawer-open-v3",), episodes=2, image_size=32, workers=1, out=out).collected
+    (collected,) = osel_sim.collect(task=("metaworld:drawer-open-v3",), episodes=2, image_size=32, every=4, workers=1, out=out).collected
     assert "2 demonstrations" in collected
     dataset = LeRobotDataset("osel_sim/metaworld_drawer-open-v3", root=out)
     first = dataset[0]
-    assert dataset.fps == 80 and first["task"] in load_tasks()["drawer-open-v3"].train
+    assert dataset.fps == 20 and first["task"] in load_tasks()["drawer-open-v3"].train
     assert first["action"].shape == (4,) and first["observation.state"].shape == (4,)
+    assert first["annotation.actions"].shape == (16,) and first["action"].tolist() == first["annotation.actions"][:4].tolist()
+    assert first["annotation.target"].tolist() == [0, 1, -1] and (first["annotation.places.corner2"][:4].abs() < 1).all()
     assert first["observation.images.corner2"].shape == first["observation.images.gripperPOV"].shape == (3, 32, 32)
     with pytest.raises(UsageError, match="is there already: give --resume"):
         osel_sim.collect(task=("metaworld:drawer-open-v3",), episodes=2, out=out)
+
+
+@made
+def test_landmarks_are_where_the_pictures_show_them(drawer):
+    drawer.load(find_task("metaworld:drawer-open-v3").instance(0))
+    assert drawer.landmark_names == ("object", "goal", "other")
+    found = drawer.landmarks(["corner2", "gripperPOV"])
+    assert not np.isnan(found["positions"][:2]).any() and np.isnan(found["positions"][2]).all()  # there is no other thing
+    (column, row), size = found["corner2"][0], 128
+    pixel = drawer.image("corner2", size, size)[int((row + 1) * size / 2), int((column + 1) * size / 2)]
+    assert (np.abs(found["corner2"][:2]) < 1).all() and np.ptp(pixel.astype(int)) < 30, "the handle is grey, the table and the drawer are brown"

@@ -91,7 +91,9 @@ def test_nothing_is_done_at_the_start_and_the_expert_does_it_in_order(env):
         if env.success:
             assert fractions[-1] == 1.0
         solved += env.success
-    assert solved >= 3
+        if solved == 3:  # whatever becomes of a fourth
+            break
+    assert solved == 3
 
 
 @pytest.mark.slow

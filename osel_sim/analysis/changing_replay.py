@@ -5,8 +5,8 @@ as one that `knew`: it had the policies and prices of after the change from the 
 """
 
 import os
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, Literal
@@ -22,6 +22,7 @@ from osel_sim.analysis.streams import Streams, draw_streams
 from osel_sim.analysis.warm_start import WarmStart, show
 from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
+from osel_sim.core.torch_settings import threads_where_imported
 from osel_sim.interface.selector import Selector, SelectorFactory
 from osel_sim.selection.changing import changing
 from osel_sim.selection.reward import combined, counted_time
@@ -222,9 +223,10 @@ def _replay_job(material: ChangingLog, factories: Mapping[str, SelectorFactory],
     own, factory = [policies[column] for column in columns], factories.get(name)
     kind, random = name.removesuffix(WARM), material.seeds[seed]
     selector: Selector = factory(own, size, random) if factory else make_selector(kind, own, size, random, **setup.settings.get(name, {}))
-    if name.endswith(WARM) and setup.warm_start is not None:
-        show(selector, WarmStart(setup.warm_start.contexts, setup.warm_start.rewards[:, columns]), own, random)
-    return job, play(selector, pieces, policies)
+    with threads_where_imported(1):  # by now a selector that needs torch has imported it
+        if name.endswith(WARM) and setup.warm_start is not None:
+            show(selector, WarmStart(setup.warm_start.contexts, setup.warm_start.rewards[:, columns]), own, random)
+        return job, play(selector, pieces, policies)
 
 
 def _run(
@@ -233,7 +235,7 @@ def _run(
     if workers == 1:
         ready()
         for job in jobs:
-            with _one_thread():
+            with threadpool_limits(1):  # the last bits of numpy's matrix products depend on the number of threads
                 result = _replay_job(material, factories, job)
             yield result
         return
@@ -248,17 +250,3 @@ def _replayer(material: ChangingLog, factories: Mapping[str, SelectorFactory]) -
     os.environ.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
     threadpool_limits(1)
     return lambda job, _: [_replay_job(material, factories, job)]
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread for matrix products: their last bits depend on the number."""
-    import torch
-
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        with threadpool_limits(1):
-            yield
-    finally:
-        torch.set_num_threads(threads)

@@ -18,8 +18,9 @@ from osel_sim.analysis.warm_start import WarmStart, show
 from osel_sim.analysis.within_budget import Within
 from osel_sim.core.errors import UsageError, WorkerError
 from osel_sim.core.processes import Lost, Work, run_jobs
+from osel_sim.core.torch_settings import threads, threads_where_imported
 from osel_sim.formats.replay_result import Choices
-from osel_sim.interface.selector import SelectorFactory
+from osel_sim.interface.selector import Selector, SelectorFactory
 from osel_sim.selection.budget import Budget
 from osel_sim.selection.reward import RewardWeights
 
@@ -182,18 +183,27 @@ def replay_one(
     Returns:
         columns chosen, (T,); -1 from where a budget pays for nothing.
     """
-    from osel_sim.selection.ppo.compiled import FastPPO, supports
-    from osel_sim.selection.ppo.sb3 import PPOSelector
     from osel_sim.selection.registry import make_selector
 
     size = contexts.shape[1]
     selector = make_selector(name, policies, size, seed, **settings) if factory is None else factory(policies, size, seed)
-    if warm_start is not None:
-        show(selector, warm_start, policies, seed)
-    if within is not None:
-        return within.play(selector, contexts, rewards, seed)
-    if isinstance(selector, PPOSelector) and supports(selector):
-        return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
+    with threads_where_imported(1):  # by now a selector that needs torch has imported it; the others do without, as that takes seconds
+        if warm_start is not None:
+            show(selector, warm_start, policies, seed)
+        if within is not None:
+            return within.play(selector, contexts, rewards, seed)
+        return _played(selector, contexts, rewards, policies)
+
+
+def _played(selector: Selector, contexts: NDArray[np.float32], rewards: NDArray[np.float64], policies: Sequence[str]) -> NDArray[np.int16]:
+    """Columns chosen, (T,): by SB3's PPO all at once where that comes to the same, else decision by decision."""
+    from osel_sim.selection.ppo.sb3 import PPOSelector
+
+    if isinstance(selector, PPOSelector):
+        from osel_sim.selection.ppo.compiled import FastPPO, supports
+
+        if supports(selector):
+            return FastPPO(selector).run(selector.network_inputs(contexts), rewards)
     column = {policy: index for index, policy in enumerate(policies)}
     chosen = np.zeros(len(contexts), np.int16)
     for decision, context in enumerate(contexts):
@@ -213,7 +223,9 @@ def _run(
     if workers == 1:
         ready()
         for job in jobs:
-            with one_thread():  # not around all of them: what is made of a part in between is not part of it
+            # The last bits of numpy's matrix products depend on the number of threads. Not around all jobs: what is made of a part in between is not
+            # part of it.
+            with threadpool_limits(1):
                 result = _replay_job(materials, factories, job)
             yield result
         return
@@ -253,13 +265,6 @@ def _replay_job(materials: Sequence[_Material], factories: Mapping[str, Selector
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One thread for matrix products: their last bits depend on the number, and workers share the cores anyway."""
-    import torch
-
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        with threadpool_limits(1):
-            yield
-    finally:
-        torch.set_num_threads(threads)
+    """One thread for matrix products, torch's too, which this imports: their last bits depend on the number, and workers share the cores anyway."""
+    with threadpool_limits(1), threads(1):
+        yield

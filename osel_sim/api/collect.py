@@ -30,6 +30,8 @@ class CollectConfig(Settings):
     """pixels, square"""
     camera: Annotated[Names, OTHER] = ()
     """cameras to record, of tasks of other suites; may be repeated (default: the first two that the environment has)"""
+    every: Annotated[Count, OTHER] = 1
+    """look at every so many control steps only, of tasks of other suites, which may run at 80 Hz: the actions between are kept"""
     level: Annotated[Levels, INSTANCES] = (0,)
     """how hard scenes are perturbed, 0 to 3; several take turns"""
     axis: Annotated[Names, INSTANCES] = ()
@@ -78,6 +80,8 @@ def collect(config: CollectConfig | None = None, /, **values: Any) -> CollectRes
         return _collect_suites(config, chosen, parse_axes(config.axis, known_axes(chosen)))
     if config.camera:
         raise SettingError("camera", "is for other suites; ours are recorded with agentview and wrist")
+    if config.every > 1:
+        raise SettingError("every", "is for other suites; ours are recorded at each of their 20 control steps a second")
     tasks = select_task_files(config.task, config.tasks, config.robot)
     axes = parse_axes(config.axis)
     outs = [config.out] if len(tasks) == 1 else [config.out / task.name for task in tasks]
@@ -103,7 +107,7 @@ def _collect_suites(config: CollectConfig, tasks: "list[Task]", axes: dict[str, 
     """The same of tasks of other suites."""
     from osel_sim.core.holding import held
     from osel_sim.training import collection
-    from osel_sim.training.suite_demonstrations import check_expert
+    from osel_sim.training.suite_demonstrations import SuiteShard, check_expert
 
     if config.episodes is None or config.out is None:
         raise SettingError("out" if config.out is None else "episodes", "is missing")
@@ -117,10 +121,12 @@ def _collect_suites(config: CollectConfig, tasks: "list[Task]", axes: dict[str, 
     done = []
     for task, out, seen in zip(tasks, outs, cameras, strict=True):
         kind: dict[str, object] = {"task": task.name, "task_version": task.info.digest, "levels": list(config.level), "axes": axes}
+        kind |= {"every": config.every if config.every > 1 else None}
         collection.check_settings(collection.shards_folder(out), kind | {"image_size": config.image_size, "cameras": list(seen)})
         if collection.seeds(out) == config.episodes:
             done.append(f"{out} is complete")
             continue
         with held(collection.shards_folder(out)):
-            done.append(collection.collect_suite(task, out, config.episodes, config.level, axes, config.image_size, seen, config.workers))
+            shard = SuiteShard(task, out, 0, 0, config.image_size, config.level, axes, seen, config.every)
+            done.append(collection.collect_suite(task, out, config.episodes, shard, config.workers))
     return CollectResult(tuple(outs), tuple(done))

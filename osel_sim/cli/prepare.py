@@ -1,4 +1,4 @@
-"""Compiles now what the first episode and the first replay would wait for: `python -m osel_sim.cli.prepare`, as `make environment` does."""
+"""Makes now what the first episode, replay and page would wait for: `python -m osel_sim.cli.prepare`, as `make environment` does."""
 
 import sys
 
@@ -6,12 +6,14 @@ from osel_sim.cli.command import reported
 
 
 def main() -> int:
-    """Compile, or find it compiled."""
+    """Compile and bundle, or find it in the caches."""
+    from osel_sim.reporting.vega import vega_script
     from osel_sim.selection.ppo import compiled
     from osel_sim.sim import osc
 
     osc.prepare()
     compiled.prepare()
+    vega_script()
     return 0
 
 

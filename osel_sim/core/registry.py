@@ -26,6 +26,7 @@ class Registry[T]:
     def __init__(self, what: str, group: str, built_in: Mapping[str, str], kind: type[T] | None = None) -> None:
         self.what, self.group = what, group
         self._built_in, self._kind = built_in, kind
+        self._loaded: dict[str, T] = {}
 
     def locations(self) -> dict[str, str]:
         """Name -> `module:attribute` of all there are."""
@@ -52,11 +53,11 @@ class Registry[T]:
             MissingPackageError: it needs a package that is not installed.
             UsageError: it cannot be imported, is of another kind, or two packages offer it; names the package and the cause.
         """
-        if name in self._built_in:
-            location, source = self._built_in[name], ""
-        else:
-            location, source = self._location(name, where)
-        return self._import(name, location, source)
+        if name not in self._built_in:
+            return self._import(name, *self._location(name, where))
+        if name not in self._loaded:  # predicates are asked for at every control step
+            self._loaded[name] = self._import(name, self._built_in[name], "")
+        return self._loaded[name]
 
     def _location(self, name: str, where: str) -> tuple[str, str]:
         """Where a plugin lies, and whose it is."""

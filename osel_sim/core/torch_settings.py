@@ -1,6 +1,7 @@
 """Torch settings that results depend on: number of threads and precision."""
 
 import contextlib
+import sys
 from collections.abc import Iterator
 
 
@@ -17,6 +18,13 @@ def threads(count: int) -> Iterator[None]:
     finally:
         if before != count:
             torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
+def threads_where_imported(count: int) -> Iterator[None]:
+    """`threads`, unless torch has not been imported: that takes seconds, and there is nothing to compute with it then."""
+    with threads(count) if "torch" in sys.modules else contextlib.nullcontext():
+        yield
 
 
 def computes_bfloat16(device: str) -> bool:

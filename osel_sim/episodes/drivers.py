@@ -14,6 +14,7 @@ from osel_sim.formats import library
 from osel_sim.formats.merged_policy import MergedSpec, is_merge, merged, parts_of
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.interface.environment import EnvironmentSpec
+from osel_sim.interface.instance import OURS
 from osel_sim.policy.environment_fit import check_environment, misfits
 from osel_sim.policy.objects import PolicyObject
 
@@ -39,7 +40,8 @@ def choose_policies(
         unfit = left_out(environment, folder)
         specs = [library.load_policy(name, folder) for name in content.files("policies", folder) if name not in unfit]
         names = [spec.name for spec in specs if not spec.is_privileged]
-        if unfit:
+        shipped = environment.name == OURS and folder is None  # those of other suites, which nobody asked about
+        if unfit and not shipped:
             logger.info("not made for the environment of %s, and left out: %s (naming one says why)", environment.name, ", ".join(unfit))
         if not names and unfit:
             raise UsageError(f"no policy there is drives in the environment of {environment.name}, such as {next(iter(unfit.values()))}")

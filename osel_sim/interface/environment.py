@@ -251,3 +251,25 @@ class TellsScene(Protocol):
         It should not depend on last bits, as of a simulation before the first step, which differ from machine to machine.
         """
         ...
+
+
+@runtime_checkable
+class TellsLandmarks(Protocol):
+    """An environment that tells where the things are that its task is about: labels of demonstrations, which no policy is shown."""
+
+    @property
+    def landmark_names(self) -> tuple[str, ...]:
+        """What they are called, the thing to be handled first; none where it cannot tell."""
+        ...
+
+    def landmarks(self, cameras: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Where they are now.
+
+        Args:
+            cameras: in whose images they are looked for.
+
+        Returns:
+            `positions` (names, 3), metres; for each camera (names, 2), column and row in [-1, 1] of its image, beyond that where out of view. NaN
+            for what this task has not.
+        """
+        ...

@@ -13,7 +13,11 @@ from torch import Tensor, nn
 
 from osel_sim.policy.text import PADDING
 
-STATE_FEATURES = 11  # position 3, rotation 6, fingers 2
+STATE_FEATURES = 11
+"""Of our own state: position 3, rotation 6, fingers 2."""
+OWN_STATE = 8
+"""Numbers of our own state, whose orientation is turned into columns of a matrix. Those of other environments are taken as they are, and begin with
+the hand's position as well."""
 PLACE_FEATURES = 3  # column, row and how peaked the heatmap is
 
 
@@ -157,6 +161,11 @@ def grid(rows: int, columns: int, device: torch.device) -> Tensor:
     return torch.stack(torch.meshgrid(y, x, indexing="ij")[::-1], dim=-1).reshape(-1, 2)
 
 
+def state_features(state: int) -> int:
+    """How many features are made of a state of so many numbers."""
+    return STATE_FEATURES if state == OWN_STATE else state
+
+
 class GroundingCamera(nn.Module):
     """Convolutions of one camera, and the grounding of queries in it.
 
@@ -164,11 +173,13 @@ class GroundingCamera(nn.Module):
         slots: how many kinds of queries there are; each has its own way from what it saw to a position.
         mounted: it moves with the gripper. Only then may the state enter an estimate, which is relative to the gripper: a fixed camera that
             knew the state would learn that things are where the gripper is, which is true of all that is carried, and never look.
+        state: features of the state.
     """
 
-    def __init__(self, config: Sizes, mounted: bool, slots: int) -> None:
+    def __init__(self, config: Sizes, mounted: bool, slots: int, state: int = STATE_FEATURES) -> None:
         super().__init__()
         self.mounted = mounted
+        pose = state - 2 if mounted else 0
         stem, width = config.stem_channels, config.channels
         self.stem = nn.Conv2d(3, stem, 5, stride=2, padding=2)
         self.reduce = nn.Conv2d(stem, width, 3, stride=2, padding=1)
@@ -178,7 +189,7 @@ class GroundingCamera(nn.Module):
         self.norm = nn.LayerNorm(width)
         self.key = nn.Linear(width, config.query_dim)
         self.scale = nn.Parameter(torch.tensor(2.0))
-        self.locate = nn.ModuleList(mlp(PLACE_FEATURES + 2 + width + (STATE_FEATURES - 2 if mounted else 0), 128, 4) for _ in range(slots))
+        self.locate = nn.ModuleList(mlp(PLACE_FEATURES + 2 + width + pose, 128, 4) for _ in range(slots))
         for layer in (self.stem, self.reduce, *trunk):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
         for layer in trunk:
@@ -207,7 +218,7 @@ class GroundingCamera(nn.Module):
 
         Args:
             queries: (batch, pairs, queries, query_dim).
-            state: (batch, STATE_FEATURES).
+            state: (batch, state features).
             first: slot of the first of them.
         """
         batch, pairs, count, width = queries.shape
@@ -222,7 +233,7 @@ class GroundingCamera(nn.Module):
         attended = attended.view(batch, pairs, count, -1)
         seen = torch.cat([found, found[..., :2].square(), attended], dim=-1)
         if self.mounted:
-            pose = state[:, None, None, 2:].expand(batch, pairs, count, STATE_FEATURES - 2)  # height, orientation, fingers
+            pose = state[:, None, None, 2:].expand(batch, pairs, count, -1)  # height, orientation, fingers
             seen = torch.cat([seen, pose], dim=-1)
         estimate = torch.stack([head(seen[:, :, index]) for index, head in enumerate(self.locate[first : first + count])], dim=2)
         position = estimate[..., :3] + state[:, None, None, :3] if self.mounted else estimate[..., :3]

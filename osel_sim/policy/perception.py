@@ -40,8 +40,8 @@ class PerceptionConfig:
 class KeypointCamera(GroundingCamera):
     """A camera that also finds keypoints which depend on the instruction."""
 
-    def __init__(self, config: PerceptionSizes, mounted: bool) -> None:
-        super().__init__(config, mounted, config.queries)
+    def __init__(self, config: PerceptionSizes, mounted: bool, state: int = STATE_FEATURES) -> None:
+        super().__init__(config, mounted, config.queries, state)
         width = config.channels
         self.film = nn.Linear(config.text_dim, 2 * width)
         self.modulated = nn.Conv2d(width, width, 3, padding=1)
@@ -58,10 +58,10 @@ class KeypointCamera(GroundingCamera):
             return (heat.transpose(1, 2) @ places).flatten(1), x.mean(dim=1)
 
 
-def percept_size(config: PerceptionSizes, cameras: int) -> int:
-    """Length of the vector that `perceive` makes."""
+def percept_size(config: PerceptionSizes, cameras: int, state: int = STATE_FEATURES) -> int:
+    """Length of the vector that `perceive` makes, with so many features of the state."""
     per_camera = config.queries * (PLACE_FEATURES + config.channels + 4) + 2 * config.keypoints + config.channels
-    return cameras * per_camera + STATE_FEATURES + config.text_dim + config.queries * 7
+    return cameras * per_camera + state + config.text_dim + config.queries * 7
 
 
 def perceive(text: TextEncoder, cameras: nn.ModuleList, image_keys: list[str], batch: dict[str, Tensor]) -> tuple[Tensor, PerceivedScene]:

@@ -12,6 +12,7 @@ from lerobot.processor.factory import make_default_policy_processor_steps, make_
 from lerobot.utils.constants import OBS_IMAGES, OBS_LANGUAGE_TOKENS, OBS_STATE
 from torch import Tensor
 
+from osel_sim.policy.grounding import OWN_STATE
 from osel_sim.policy.scene import OBS_ROTATION
 from osel_sim.policy.text import PIECES, tokenise
 
@@ -137,12 +138,13 @@ def make_pipelines(config: Any, dataset_stats: dict[str, dict[str, Any]] | None)
         dataset_stats: LeRobot statistics of what the configuration normalises.
     """
     reading: Reading = config
+    state = config.robot_state_feature
     steps = make_default_policy_processor_steps(config, dataset_stats, normalizer_device=config.device)
     before = [
         steps.rename_observations,
         steps.add_batch_dim,
         HashedTextStep(reading.vocabulary, reading.text_length),
-        RotationStep(),
+        *([RotationStep()] if state is None or state.shape[0] == OWN_STATE else []),
         ImageSizeStep(reading.image_size),
         steps.to_device,
         steps.normalize,

@@ -34,7 +34,7 @@ class PerceivedScene:
     """What a policy made of a batch before it thinks about actions.
 
     Attributes:
-        state: (batch, STATE_FEATURES): position, rotation columns, fingers.
+        state: (batch, features): position, rotation columns, fingers; of another environment's state its own numbers.
         text: of its own instruction and the others, the latter flattened into the batch: (batch * (1 + pairs), ...).
         sentence: (batch, text_dim), of its own instruction.
         views: what each camera saw; raw: its map before the norm; grounded: what the instruction's queries found in it.
@@ -52,7 +52,9 @@ class PerceivedScene:
 
 def look(text: TextEncoder, cameras: Iterable[nn.Module], image_keys: list[str], batch: Mapping[str, Tensor]) -> PerceivedScene:
     """See and read: nothing here knows the state but cameras that move with the gripper."""
-    state = torch.cat([batch[OBS_STATE][:, :3], batch[OBS_ROTATION], batch[OBS_STATE][:, 6:8]], dim=-1).float()
+    state = batch[OBS_STATE].float()
+    if OBS_ROTATION in batch:
+        state = torch.cat([state[:, :3], batch[OBS_ROTATION].float(), state[:, 6:8]], dim=-1)
     tokens = batch[OBS_LANGUAGE_TOKENS][:, None]
     if GROUNDING_TOKENS in batch:
         tokens = torch.cat([tokens, batch[GROUNDING_TOKENS]], dim=1)

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +12,7 @@ from osel_sim.core.shown import all_shown, shown
 from osel_sim.reporting.charts import Figure, to_images
 from osel_sim.reporting.html_tables import Table, to_csv, to_parts
 from osel_sim.reporting.palette import DARK, LIGHT
+from osel_sim.reporting.vega import vega_script
 
 PAGE, FIGURES, TABLES = "report.html", "figures", "tables"
 Block = str | Figure | Table
@@ -145,7 +145,7 @@ def to_html(page: Page, live: Live | None = None) -> str:
         "figures": {figure.name: figure.spec for figure in page.figures},
         "episodes": page.episodes.data if page.episodes else None,
     }
-    return _rendered("report.html.j2", page=page, parts=to_parts, live=live, vega=Markup(_vega()), data=Markup(_embedded(data)))
+    return _rendered("report.html.j2", page=page, parts=to_parts, live=live, vega=Markup(vega_script()), data=Markup(_embedded(data)))
 
 
 def waiting_html(folder: Path, live: Live, problem: str = "") -> str:
@@ -163,15 +163,6 @@ def _rendered(name: str, **values: Any) -> str:
     files = {"css": "report.css", "script": "report.js", "live_script": "live.js"}
     own = {key: Markup((template / file).read_text(encoding="utf-8")) for key, file in files.items()}
     return environment.from_string((template / name).read_text(encoding="utf-8")).render(light=LIGHT, dark=DARK, **own, **values)
-
-
-@cache
-def _vega() -> str:
-    """Vega, Vega-Lite and vega-embed as one script, as vl-convert brings them. It names what it defines globally, hence the function around it."""
-    import vl_convert
-
-    script = vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")
-    return f"(() => {{{script}}})();".replace("</script", "<\\/script")
 
 
 def _finalize(value: Any) -> Any:

@@ -180,12 +180,6 @@ class BayesianSelector(SharedRows, SelectorBase):
         return self._signal
 
     @property
-    def parts_used(self) -> str:
-        """Which parts of a context the features are of by the evidence so far: `first`, `both` or `second`; `whole` where it has no parts."""
-        self._catch_up()
-        return ("first", "both", "second")[self._view] if self._prior.parts else "whole"
-
-    @property
     def _features(self) -> Features:
         return self._views[self._view]
 

@@ -4,27 +4,18 @@ Decimated once with fast-simplification and kept in the user's cache folder. Mes
 same to the last bit; where a robot shows such a mesh as well, what it shows becomes a mesh of its own.
 """
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.core.arrays import read_arrays
-from osel_sim.core.caches import prepare
-from osel_sim.core.errors import DataError
-from osel_sim.core.files import atomic, content_digest
 from osel_sim.interface.robot import LightMeshes
+from osel_sim.sim.kept import kept
 
 ROBOT = ("robot0_", "gripper0_", "fixed_mount0_")
 """How the names of a robot's meshes begin."""
 SHOWN = "_shown"
 """How the name of a light mesh ends that is there beside the colliding one."""
-
-
-def cache_folder() -> Path:
-    """Where light meshes are kept: `osel_sim` among the user's caches."""
-    return prepare() / "osel_sim"
 
 
 def lighten(spec: Any, xml: str, how: LightMeshes) -> None:
@@ -39,11 +30,7 @@ def lighten(spec: Any, xml: str, how: LightMeshes) -> None:
     import robosuite
 
     made_of = f"{how.keep} {how.fewest} {how.most} {how.join} {mujoco.__version__} {robosuite.__version__} {SHOWN} {xml}"
-    file = cache_folder() / f"light_meshes_{content_digest(made_of)[:16]}.npz"
-    light = _load(file)
-    if light is None:
-        light = _make(mujoco.MjModel.from_xml_string(xml), how)
-        _save(file, light)
+    light = kept("light_meshes", made_of, lambda: _make(mujoco.MjModel.from_xml_string(xml), how))
     for name in [key.removesuffix(".vertices") for key in light if key.endswith(".vertices")]:
         mesh = spec.mesh(name) or spec.add_mesh(name=name)
         # Given by vertices instead of a file; the file's scale is in them already.
@@ -144,16 +131,3 @@ def _proper(faces: NDArray[Any]) -> NDArray[np.int32]:
     """Faces with three different corners."""
     kept: NDArray[np.int32] = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 0] != faces[:, 2])].astype(np.int32)
     return kept
-
-
-def _save(file: Path, light: dict[str, NDArray[Any]]) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with atomic(file, shared=True) as partial, partial.open("wb") as handle:
-        np.savez(handle, **light)  # type: ignore[arg-type]
-
-
-def _load(file: Path) -> dict[str, NDArray[Any]] | None:
-    try:
-        return read_arrays(file, "meshes")
-    except DataError:  # missing, or torn by a crash: make it anew
-        return None

@@ -32,10 +32,10 @@ class UnitMean:
         """How far the mean may lie from the truth to one side, wrong with probability `tail`: Student's t, and what is rare."""
         if self.units < 2:
             return math.inf
-        from scipy.stats import t
+        from scipy.special import stdtrit  # scipy.stats has it too, and takes a second to import
 
         # What happens with probability p has not happened in n units with probability (1 - p)^n: p is below log(1 / tail) / n (the rule of three).
-        return math.hypot(float(t.isf(tail, self.units - 1)) * self.error, self.rare * -math.log(tail) / self.units)
+        return math.hypot(-float(stdtrit(self.units - 1, tail)) * self.error, self.rare * -math.log(tail) / self.units)
 
     def interval(self, confidence: float = 0.95) -> Interval:
         """Two-sided."""

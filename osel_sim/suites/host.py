@@ -26,7 +26,7 @@ from websockets.sync.server import serve as listen
 
 from osel_sim.core.errors import OselError
 from osel_sim.core.shown import TOKEN_VARIABLE
-from osel_sim.interface.environment import Environment, Expert, HasExpert, TellsScene
+from osel_sim.interface.environment import Environment, Expert, HasExpert, TellsLandmarks, TellsScene
 from osel_sim.remote.codec import pack, unpack
 from osel_sim.remote.serving import stop_with_stdin
 from osel_sim.suites.base import PlainInstance
@@ -65,6 +65,7 @@ class Table:
             "restore": self._restore,
             "expert": self._expert,
             "act": lambda env, message: {"action": np.asarray(self._experts[message["env"]].act(), np.float64)},
+            "landmarks": self._landmarks,
             "close": self._close,
         }
 
@@ -89,7 +90,8 @@ class Table:
     def _open(self, task: str) -> Message:
         env, number = self._module.open_environment(task), self._next
         self._envs[number], self._next = env, number + 1
-        return {"env": number, "specification": env.specification.to_dict(), "expert": isinstance(env, HasExpert)}
+        names = env.landmark_names if isinstance(env, TellsLandmarks) else ()
+        return {"env": number, "specification": env.specification.to_dict(), "expert": isinstance(env, HasExpert), "landmarks": list(names)}
 
     def _load(self, env: Environment, message: Message) -> Message:
         env.load(PlainInstance(**message["instance"]))
@@ -104,6 +106,11 @@ class Table:
             raise TypeError(f"the environment of {env.specification.name} has no scripted expert")
         self._experts[message["env"]] = env.expert()
         return {}
+
+    def _landmarks(self, env: Environment, message: Message) -> Message:
+        if not isinstance(env, TellsLandmarks):
+            raise TypeError(f"the environment of {env.specification.name} tells of no landmarks")
+        return {"landmarks": env.landmarks(message["cameras"])}
 
     def _close(self, env: Environment, message: Message) -> Message:
         self._experts.pop(message["env"], None)

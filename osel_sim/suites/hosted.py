@@ -243,6 +243,15 @@ class HostedEnvironment:
         """The expert's next action (D,)."""
         return np.array(self._ask("act")["action"], np.float64)
 
+    @property
+    def landmark_names(self) -> tuple[str, ...]:
+        """What it tells the places of; nothing where it cannot."""
+        return self._landmark_names
+
+    def landmarks(self, cameras: Sequence[str]) -> dict[str, NDArray[Any]]:
+        """Where those are now."""
+        return {name: np.array(value) for name, value in self._ask("landmarks", cameras=list(cameras))["landmarks"].items()}
+
     def close(self) -> None:
         """Give it back. The host stays, for others and for the next."""
         if not self._closed:
@@ -254,6 +263,7 @@ class HostedEnvironment:
         answer = self._host.ask({"do": "open", "task": self._task})
         self._number, self._life = int(answer["env"]), self._host.life
         self._specification = EnvironmentSpec.from_dict(answer["specification"])
+        self._landmark_names = tuple(answer["landmarks"])
         self._status = {"steps": 0, "success": False, "subgoals": 0.0, "done": False, "hold": []}
         self._untouched = True
 

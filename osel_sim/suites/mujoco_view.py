@@ -80,12 +80,25 @@ class MujocoView:
             raise UsageError(
                 f"quality must be one of {', '.join(QUALITIES)}, sizes within 1 to {LARGEST} pixels; got {quality!r}, {width} x {height}"
             )
+        copy = self._followed(quality)
+        image = _renderer(copy, quality, self._shown).render(copy.data, self.cameras.index(camera), width, height)
+        return np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
+
+    def places(self, camera: str, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Column and row (N, 2) of world points (N, 3) in a camera's square image, within [-1, 1] where they are in it; NaN behind the camera."""
+        copy, index = self._followed("fast"), self.cameras.index(camera)
+        seen = (points - copy.data.cam_xpos[index]) @ copy.data.cam_xmat[index].reshape(3, 3)
+        depth = -seen[:, 2:] * np.tan(np.radians(copy.model.cam_fovy[index]) / 2)
+        places: NDArray[np.float64] = seen[:, :2] * (1.0, -1.0) / np.where(depth > 0, depth, np.nan)
+        return -places if camera in self._upside_down else places
+
+    def _followed(self, quality: str) -> "_Copy":
+        """The model to be looked at, as the world is now."""
         if quality not in self._copies:
             self._copies[quality] = _Copy(self._describe(), quality, self._model, self._make_light)
         copy = self._copies[quality]
         copy.follow(self._model, self._data, self._look)
-        image = _renderer(copy, quality, self._shown).render(copy.data, self.cameras.index(camera), width, height)
-        return np.ascontiguousarray(image[::-1, ::-1]) if camera in self._upside_down else image
+        return copy
 
     def close(self) -> None:
         """Give the GL contexts back."""

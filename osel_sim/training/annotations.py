@@ -26,6 +26,8 @@ POSITIONS, PRESENT, TARGET, ACTIVE, PLACES = (
     "annotation.active",
     "annotation.places.",
 )
+ACTIONS = "annotation.actions"
+"""The actions of all control steps from a frame to the next, where frames are fewer than steps."""
 
 
 @dataclass(frozen=True)

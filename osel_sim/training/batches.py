@@ -31,7 +31,7 @@ def statistics_of(data: Sequence[Demonstrations], frames: Sequence[NDArray[np.in
     """LeRobot statistics of state and action over the training frames of all datasets."""
     result: Statistics = {}
     for key, floor in ((OBS_STATE, STATE_FLOOR), (ACTION, ACTION_FLOOR)):
-        columns = [one.state if key == OBS_STATE else one.action for one in data]
+        columns = [one.state if key == OBS_STATE else one.action[:: one.every] for one in data]
         values = np.concatenate([column[own] for column, own in zip(columns, frames, strict=True)])
         spread = np.maximum(values.std(axis=0), floor)
         result[key] = {"mean": torch.from_numpy(values.mean(axis=0)), "std": torch.from_numpy(spread)}

@@ -5,8 +5,9 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from osel_sim.core.errors import DataError, UsageError, WorkerError
 from osel_sim.core.files import atomic_folder, read_json, write_text
@@ -15,6 +16,9 @@ from osel_sim.formats.task_file import TaskSpec
 from osel_sim.interface.suite import Task
 from osel_sim.training.annotations import SIDE_FILE
 from osel_sim.training.demonstrations import DONE, Shard, side_file
+
+if TYPE_CHECKING:
+    from osel_sim.training.suite_demonstrations import SuiteShard
 
 logger = logging.getLogger(__name__)
 
@@ -58,17 +62,18 @@ def collect(task: TaskSpec, out: Path, episodes: int, levels: tuple[int, ...], a
     return _collect(task.name, shards, out, workers, lambda failed: side_file(task, levels, axes, len(shards), episodes, failed))
 
 
-def collect_suite(
-    task: Task, out: Path, episodes: int, levels: tuple[int, ...], axes: Mapping[str, int], image_size: int, cameras: tuple[str, ...], workers: int
-) -> str:
-    """The same of a task of another suite, whose environment has a scripted expert."""
-    from osel_sim.training.suite_demonstrations import SuiteShard, suite_side_file
+def collect_suite(task: Task, out: Path, episodes: int, shard: "SuiteShard", workers: int) -> str:
+    """The same of a task of another suite, whose environment has a scripted expert.
+
+    Args:
+        shard: what all shards have in common; folder and seeds are set here.
+    """
+    from osel_sim.training.suite_demonstrations import suite_side_file
 
     shards = [
-        SuiteShard(task, shards_folder(out) / f"{first:06d}-{count}", first, count, image_size, levels, axes, cameras)
-        for first, count in _parts(episodes)
+        replace(shard, folder=shards_folder(out) / f"{first:06d}-{count}", first_seed=first, episodes=count) for first, count in _parts(episodes)
     ]
-    return _collect(task.name, shards, out, workers, lambda failed: suite_side_file(task, levels, axes, len(shards), episodes, failed))
+    return _collect(task.name, shards, out, workers, lambda failed: suite_side_file(task, shard.levels, shard.axes, shards, episodes, failed))
 
 
 class Recordable(Protocol):

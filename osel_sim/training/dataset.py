@@ -18,12 +18,12 @@ from osel_sim.core.errors import DataError
 from osel_sim.core.files import atomic, content_digest, is_partial, read_json
 from osel_sim.core.parquet import PARQUET_ERRORS, open_parquet, unreadable
 from osel_sim.core.progress import progress as progress_bar
-from osel_sim.formats.dataset_mapping import DatasetMapping
+from osel_sim.formats.dataset_mapping import ACTION, STATE, DatasetMapping
 from osel_sim.ingestion.lerobot_check import INFO, open_dataset
 from osel_sim.ingestion.lerobot_files import DatasetFiles
 from osel_sim.ingestion.lerobot_numbers import actions, states
 from osel_sim.policy.mapping import turned_over
-from osel_sim.training.annotations import SIDE_FILE, Annotations, load_annotations
+from osel_sim.training.annotations import ACTIONS, SIDE_FILE, Annotations, load_annotations
 
 DECODE_ROWS = 512
 
@@ -34,7 +34,8 @@ class Demonstrations:
 
     Attributes:
         images: camera -> uint8 (frames, H, W, 3), mapped from disk.
-        state, action: float32 (frames, 8) and (frames, 7).
+        state, action: float32 (frames, state) and (frames * every, action); of our tasks 8 and 7 numbers, of others as their environment has them.
+        every: control steps a frame, each with an action of its own.
         task: the instruction of each frame's episode, as an index into `tasks`.
         starts: first frame of each episode, and the number of frames at the end: (episodes + 1,).
         annotations: None where the dataset has none; then only actions are learned.
@@ -51,6 +52,7 @@ class Demonstrations:
     starts: NDArray[np.int64]
     annotations: Annotations | None
     name: str
+    every: int = 1
 
     @property
     def episodes(self) -> int:
@@ -75,7 +77,14 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
             raise DataError(f"{folder}: its images {mapping.camera(camera)!r} are videos; training reads images that are stored without video")
     columns = {name: files.numbers(name, finite=False) for name in files.features if name.startswith("annotation.")}
     fingerprint = _fingerprint(folder, files.files, mapping)
-    state, action = states(files, mapping), actions(files, mapping)
+    task = task_of(folder)
+    if task is not None and ":" in task:  # of another suite: its environment says what the numbers are, and its policies know no other
+        state, action = (files.numbers(name).astype(np.float32) for name in (STATE, ACTION))
+    else:
+        state, action = states(files, mapping), actions(files, mapping)
+    between = columns.pop(ACTIONS, None)
+    if between is not None:
+        action = between.astype(np.float32).reshape(-1, action.shape[1])
     return Demonstrations(
         folder=folder,
         fingerprint=fingerprint,
@@ -86,7 +95,8 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
         tasks=files.tasks,
         starts=files.starts,
         annotations=load_annotations(folder, columns),
-        name=task_of(folder) or folder.resolve().name,
+        name=task or folder.resolve().name,
+        every=len(action) // len(state),
     )
 
 

@@ -44,7 +44,7 @@ def validate(policy: Any, held: HeldOut, index: int, frames: int, roles: list[st
         roles: names of the roles of that dataset's instructions.
 
     Returns:
-        action_error (mean absolute error of the six motions), gripper_accuracy, and where labelled <role>_cm (median distance between estimated and
+        action_error (mean absolute error of the motions), gripper_accuracy, and where labelled <role>_cm (median distance between estimated and
         true position, centimetres).
     """
     errors: list[Tensor] = []
@@ -59,8 +59,8 @@ def validate(policy: Any, held: HeldOut, index: int, frames: int, roles: list[st
             truth, valid = raw[ACTION][:, : held.executed], ~raw["action_is_pad"][:, : held.executed]
             batch = held.preprocess(dict(raw))
             actions = held.postprocess(policy.predict_action_chunk(batch))[:, : held.executed].cpu()
-            errors.append((actions[..., :6].clamp(-1, 1) - truth[..., :6]).abs().mean(-1)[valid])
-            hits.append(((actions[..., 6] > 0) == (truth[..., 6] > 0))[valid].float())
+            errors.append((actions[..., :-1].clamp(-1, 1) - truth[..., :-1]).abs().mean(-1)[valid])
+            hits.append(((actions[..., -1] > 0) == (truth[..., -1] > 0))[valid].float())
             if GROUNDING_POSITIONS in raw and hasattr(policy, "locate"):
                 offset = (policy.locate(batch).cpu() - raw[GROUNDING_POSITIONS][:, 0]) * held.spread
                 distances.append(offset.norm(dim=-1))

@@ -16,7 +16,7 @@ from osel_sim.core.errors import UsageError
 from osel_sim.core.files import atomic_files
 from osel_sim.formats.dataset_mapping import IMAGES
 from osel_sim.formats.policy_file import PolicySpec
-from osel_sim.interface.specification import ACTION_DIM, STATE_DIM
+from osel_sim.interface.specification import STATE_DIM
 from osel_sim.policy import register
 from osel_sim.policy.language_chunk import LanguageChunkConfig
 from osel_sim.policy.perception import Perception, PerceptionConfig, percept_size
@@ -130,9 +130,12 @@ def make_model(spec: PolicySpec, recipe: Recipe, data: list[Demonstrations], sta
         raise UsageError(f"the datasets' images differ in size ({shapes}): collect them with one --image-size")
     given = {camera: next(iter(own)) for camera, own in shapes.items()}
     settings: dict[str, Any] = {**recipe.model, "n_action_steps": 1, "device": device, "push_to_hub": False}
-    inputs = {OBS_STATE: PolicyFeature(FeatureType.STATE, (STATE_DIM,))}
+    state, action = (_width(statistics[key]) for key in (OBS_STATE, ACTION))
+    inputs = {OBS_STATE: PolicyFeature(FeatureType.STATE, (state,))}
     perception = None
     if recipe.type == "act":
+        if state != STATE_DIM:
+            raise UsageError(f"{recipe.file}: type 'act' knows only the {STATE_DIM} numbers of our own state, these demonstrations have {state}")
         side = settings.pop("image_size", ACT_IMAGE)
         if any(side > min(shape) for shape in given.values()):
             raise UsageError(f"{recipe.file}: image_size = {side} is more than the datasets' images have: {given}")
@@ -145,8 +148,13 @@ def make_model(spec: PolicySpec, recipe: Recipe, data: list[Demonstrations], sta
     else:
         settings |= {"gripper_weight": recipe.optimisation.gripper_weight, "grounding_weight": recipe.optimisation.grounding_weight}
         inputs |= {IMAGES + camera: PolicyFeature(FeatureType.VISUAL, (3, *shape)) for camera, shape in given.items()}
-    settings["input_features"], settings["output_features"] = inputs, {ACTION: PolicyFeature(FeatureType.ACTION, (ACTION_DIM,))}
+    settings["input_features"], settings["output_features"] = inputs, {ACTION: PolicyFeature(FeatureType.ACTION, (action,))}
     config = make_policy_config(recipe.type, **settings)
     if spec.execute > config.chunk_size:
         raise UsageError(f"{spec.file}: execute = {spec.execute} is more than the recipe's chunk_size = {config.chunk_size}")
     return Model(replace(config, n_action_steps=spec.execute), statistics, recipe, perception)
+
+
+def _width(statistics: dict[str, Tensor]) -> int:
+    """How many numbers a feature has."""
+    return len(statistics["mean"])

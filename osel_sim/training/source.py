@@ -45,7 +45,7 @@ class SampleSource:
     """Makes samples of one dataset.
 
     Args:
-        center, spread: mean and standard deviation of the state, (8,) each, by which positions and noise are scaled.
+        center, spread: mean and standard deviation of the state, (state,) each, by which positions and noise are scaled.
     """
 
     def __init__(
@@ -75,8 +75,9 @@ class SampleSource:
         return batch
 
     def _plain(self, frames: NDArray[np.int64]) -> dict[str, Any]:
-        ahead = frames[:, None] + np.arange(self._wanted.chunk_size)
-        last = self._last[frames][:, None]
+        every = self._data.every
+        ahead = frames[:, None] * every + np.arange(self._wanted.chunk_size)
+        last = (self._last[frames][:, None] + 1) * every - 1
         return {
             OBS_STATE: torch.from_numpy(self._data.state[frames]),
             ACTION: torch.from_numpy(self._data.action[np.minimum(ahead, last)]),

@@ -74,6 +74,10 @@ def load_datasets(folders: Sequence[Path], spec: PolicySpec, recipe: Recipe, map
     conventions = load_dataset_mapping(mapping)
     check_mapping(conventions, mapping, spec.cameras)
     data = [load_demonstrations(folder, spec.cameras, mapping=conventions) for folder in wanted]
+    for kind in ("state", "action"):
+        widths = {one.name: getattr(one, kind).shape[1] for one in data}
+        if len(set(widths.values())) > 1:
+            raise DataError(f"the demonstrations of {', '.join(widths)} have different numbers of {kind}: {widths}; one policy cannot learn both")
     labelled = {one.name: one.annotations is not None for one in data}
     located = {one.name: one.annotations is not None and all(one.annotations.sees(camera) for camera in spec.cameras) for one in data}
     for known, what in ((labelled, "annotations"), (located, "known places in the images")):

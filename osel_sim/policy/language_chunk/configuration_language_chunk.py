@@ -12,7 +12,7 @@ class LanguageChunkConfig(PreTrainedConfig):  # type: ignore[misc]  # LeRobot is
     """Sizes of the language-conditioned chunk policy.
 
     Attributes:
-        chunk_size: actions predicted at once, at 20 Hz.
+        chunk_size: actions predicted at once, at the control rate of the environment.
         n_action_steps: how many of them `select_action` hands out before it looks again.
         image_size: images are brought to this square size (area average) by the preprocessor.
         stem_channels, channels: width of the first convolution (half resolution) and of the others (quarter resolution).
@@ -25,7 +25,7 @@ class LanguageChunkConfig(PreTrainedConfig):  # type: ignore[misc]  # LeRobot is
         gripper_weight: weight of the gripper in the L1 loss, the six motions having 1.
         grounding_weight: weight of the entity-position loss, used where the batch carries such labels.
         attention_weight: weight of the loss that makes queries look where their entity is in the image, likewise.
-        mounted_cameras: cameras that move with the gripper; what they find is relative to it.
+        mounted_cameras: cameras that move with the gripper, ours and Meta-World's; what they find is relative to it.
     """
 
     n_obs_steps: int = 1
@@ -47,7 +47,7 @@ class LanguageChunkConfig(PreTrainedConfig):  # type: ignore[misc]  # LeRobot is
     gripper_weight: float = 0.5
     grounding_weight: float = 0.5
     attention_weight: float = 0.1
-    mounted_cameras: tuple[str, ...] = ("wrist",)
+    mounted_cameras: tuple[str, ...] = ("wrist", "gripperPOV", "behindGripper")
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -63,7 +63,7 @@ class LanguageChunkConfig(PreTrainedConfig):  # type: ignore[misc]  # LeRobot is
             raise ValueError(f"n_action_steps must lie in [1, chunk_size = {self.chunk_size}], got {self.n_action_steps}")
 
     def validate_features(self) -> None:
-        """The policy needs at least one image, the 8-d state and an action."""
+        """The policy needs at least one image, the state and an action."""
         if not self.image_features or self.robot_state_feature is None or self.action_feature is None:
             raise ValueError("language_chunk needs at least one image, observation.state and action among its features")
 

@@ -12,7 +12,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from osel_sim.policy.grounding import TextEncoder
+from osel_sim.policy.grounding import TextEncoder, state_features
 from osel_sim.policy.language_chunk.configuration_language_chunk import LanguageChunkConfig
 from osel_sim.policy.language_chunk.network import ActionHead
 from osel_sim.policy.perception import KeypointCamera, perceive, percept_size
@@ -29,13 +29,16 @@ class LanguageChunkPolicy(ChunkQueue, PreTrainedPolicy):  # type: ignore[misc]
         super().__init__(config)
         config.validate_features()
         self.config: LanguageChunkConfig = config
-        action = config.action_feature
-        if action is None:  # validate_features has said so already; this is for the type checker
-            raise ValueError("language_chunk needs an action feature")
+        action, state = config.action_feature, config.robot_state_feature
+        if action is None or state is None:  # validate_features has said so already; this is for the type checker
+            raise ValueError("language_chunk needs a state and an action feature")
+        own = state_features(state.shape[0])
         self.image_keys = list(config.image_features)
         self.text = TextEncoder(config)
-        self.cameras = nn.ModuleList(KeypointCamera(config, key.split(".")[-1] in config.mounted_cameras) for key in self.image_keys)
-        self.head = ActionHead(percept_size(config, len(self.image_keys)), config.hidden, config.hidden_layers, config.chunk_size, action.shape[0])
+        self.cameras = nn.ModuleList(KeypointCamera(config, key.split(".")[-1] in config.mounted_cameras, own) for key in self.image_keys)
+        self.head = ActionHead(
+            percept_size(config, len(self.image_keys), own), config.hidden, config.hidden_layers, config.chunk_size, action.shape[0]
+        )
         self.reset()
 
     def compute(self, batch: dict[str, Tensor]) -> tuple[Tensor, PerceivedScene]:

@@ -12,7 +12,7 @@ class OctoChunkConfig(PreTrainedConfig):  # type: ignore[misc]  # LeRobot is unt
     """Sizes of the Octo-style policy.
 
     Attributes:
-        chunk_size: actions predicted at once, at 20 Hz.
+        chunk_size: actions predicted at once, at the control rate of the environment.
         n_action_steps: how many of them `select_action` hands out before it looks again.
         image_size: images are brought to this square size (area average) by the preprocessor.
         stem_channels, channels: width of the first convolution (half resolution) and of the others (quarter resolution).
@@ -30,7 +30,7 @@ class OctoChunkConfig(PreTrainedConfig):  # type: ignore[misc]  # LeRobot is unt
         gripper_weight: weight of the gripper in the loss, the six motions having 1.
         grounding_weight: weight of the position losses, used where the batch carries such labels.
         attention_weight: weight of the losses that make queries look where their thing is in the image, likewise.
-        mounted_cameras: cameras that move with the gripper; what they find is relative to it.
+        mounted_cameras: cameras that move with the gripper, ours and Meta-World's; what they find is relative to it.
     """
 
     n_obs_steps: int = 1
@@ -59,7 +59,7 @@ class OctoChunkConfig(PreTrainedConfig):  # type: ignore[misc]  # LeRobot is unt
     gripper_weight: float = 0.5
     grounding_weight: float = 0.5
     attention_weight: float = 0.1
-    mounted_cameras: tuple[str, ...] = ("wrist",)
+    mounted_cameras: tuple[str, ...] = ("wrist", "gripperPOV", "behindGripper")
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -79,7 +79,7 @@ class OctoChunkConfig(PreTrainedConfig):  # type: ignore[misc]  # LeRobot is unt
             raise ValueError(f"image_size = {self.image_size} must be a multiple of four times patch = {self.patch}")
 
     def validate_features(self) -> None:
-        """The policy needs at least one image, the 8-d state and an action."""
+        """The policy needs at least one image, the state and an action."""
         if not self.image_features or self.robot_state_feature is None or self.action_feature is None:
             raise ValueError("octo_chunk needs at least one image, observation.state and action among its features")
 

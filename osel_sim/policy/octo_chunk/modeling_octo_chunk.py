@@ -14,7 +14,7 @@ from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
-from osel_sim.policy.grounding import PLACE_FEATURES, STATE_FEATURES, Grounding, GroundingCamera, TextEncoder, fuse, mlp
+from osel_sim.policy.grounding import PLACE_FEATURES, Grounding, GroundingCamera, TextEncoder, fuse, mlp, state_features
 from osel_sim.policy.octo_chunk.configuration_octo_chunk import OctoChunkConfig
 from osel_sim.policy.octo_chunk.network import FlowHead, Readout
 from osel_sim.policy.scene import ChunkQueue, PerceivedScene, action_weight, grounding_losses, look, own_geometry
@@ -34,24 +34,24 @@ class OctoChunkPolicy(ChunkQueue, PreTrainedPolicy):  # type: ignore[misc]
         super().__init__(config)
         config.validate_features()
         self.config: OctoChunkConfig = config
-        feature = config.action_feature
-        if feature is None:  # validate_features has said so already; this is for the type checker
-            raise ValueError("octo_chunk needs an action feature")
-        width, action_dim = config.width, feature.shape[0]
+        feature, state = config.action_feature, config.robot_state_feature
+        if feature is None or state is None:  # validate_features has said so already; this is for the type checker
+            raise ValueError("octo_chunk needs a state and an action feature")
+        width, action_dim, own = config.width, feature.shape[0], state_features(state.shape[0])
         self.image_keys = list(config.image_features)
         mounted = [key.split(".")[-1] in config.mounted_cameras for key in self.image_keys]
         self.text = TextEncoder(config)
-        self.cameras = nn.ModuleList(GroundingCamera(config, moves, config.queries + ACTIVE) for moves in mounted)
+        self.cameras = nn.ModuleList(GroundingCamera(config, moves, config.queries + ACTIVE, own) for moves in mounted)
         self.words = nn.Linear(config.text_dim, width)
         self.patches = nn.ModuleList(nn.Conv2d(config.channels, width, config.patch, stride=config.patch) for _ in mounted)
-        self.proprioception = mlp(STATE_FEATURES, width, width)
+        self.proprioception = mlp(own, width, width)
         self.things = nn.Linear(7 + len(mounted) * (PLACE_FEATURES + config.channels), width)
         self.kinds = nn.Parameter(0.02 * torch.randn(3 + len(mounted), width))  # tells words, state, things and each camera's patches apart
         self.roles = nn.Parameter(0.02 * torch.randn(config.queries, width))
         self.trunk = Readout(width, config.attention_heads, config.layers, ACTIVE + config.readouts)
         self.seek = nn.ModuleList(mlp(width, width, config.query_dim) for _ in range(ACTIVE))
         geometry = (config.queries + ACTIVE) * (7 + len(mounted) * (PLACE_FEATURES + 4))
-        inputs = (ACTIVE + config.readouts) * width + STATE_FEATURES + geometry
+        inputs = (ACTIVE + config.readouts) * width + own + geometry
         self.head = FlowHead(inputs, config.hidden, config.hidden_layers, config.chunk_size, action_dim)
         noise = torch.randn(config.chunk_size, action_dim, generator=torch.Generator().manual_seed(NOISE_SEED))
         self.register_buffer("noise", noise, persistent=False)

@@ -1,6 +1,6 @@
 """A task of Meta-World as an environment. Imported where metaworld is installed: here, or in the suite's host process."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,6 +26,8 @@ PIVOT = np.array([0.0, 0.65, 0.1])
 """What cameras are turned about: the middle of the table, metres."""
 SIGNALS = {"near": ("near_object", 1.0), "grasp": ("grasp_success", 1.0), "place": ("in_place_reward", 0.5)}
 """Subgoal -> the environment's own signal, and from where on it counts as reached."""
+LANDMARKS = {"object": slice(4, 7), "goal": slice(36, 39), "other": slice(11, 14)}
+"""Where they are among the 39 numbers that its experts see."""
 
 
 class MetaworldEnvironment(BaseEnvironment):
@@ -144,6 +146,17 @@ class MetaworldEnvironment(BaseEnvironment):
         from metaworld.policies import ENV_POLICY_MAP
 
         return MetaworldExpert(ENV_POLICY_MAP[self._task](), self)
+
+    @property
+    def landmark_names(self) -> tuple[str, ...]:
+        """What Meta-World's own observation tells of."""
+        return tuple(LANDMARKS)
+
+    def landmarks(self, cameras: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+        """Where its objects and the goal are; NaN where a task has none."""
+        positions = np.stack([self._observation[place] for place in LANDMARKS.values()])
+        positions[~positions.any(axis=1)] = np.nan  # what is not there has zeros
+        return {"positions": positions, **{camera: self._view.places(camera, positions) for camera in cameras}}
 
     def seen_by_expert(self) -> NDArray[np.float64]:
         """The simulator's own observation (39,), goal included."""
