@@ -8,6 +8,7 @@ from osel_sim.cli.command import Command
 EXAMPLES = """examples:
   python -m osel_sim.collect --task pick_place --episodes 1500 --out data/pick_place
   python -m osel_sim.collect --task all --episodes 200 --level 0 1 --out data/suite
+  python -m osel_sim.collect --task metaworld:all --episodes 40 --every 4 --image-size 80 --out data/metaworld
   python -m osel_sim.collect --task pick_place --episodes 3000 --out data/pick_place --resume     (goes on after an interruption, or adds to it)
 """
 
@@ -20,7 +21,8 @@ def _execute(config: CollectConfig) -> int:
     for line in result.collected:
         print(line)
     out = config.out or result.datasets[0]
-    print_next(("trains a policy on it", "train", ["--policy", "local_small", "--data", out, "--out", "runs/train/local_small"]))
+    policy = "metaworld_small" if config.task[0].startswith("metaworld:") else "local_small"
+    print_next(("trains a policy on it", "train", ["--policy", policy, "--data", out, "--out", f"runs/train/{policy}"]))
     return 0
 
 

@@ -57,10 +57,10 @@ def test_a_fall_from_78_to_51_percent_is_told_soon(before, after):
     told = alarmed.any(axis=0)
     assert told.mean() >= 0.9
     assert np.median(alarmed.argmax(axis=0)[told]) < 90
-    fall = detector.likeliest(int(told.argmax()))
-    assert abs(fall.since - 200) < 25
-    assert fall.before == pytest.approx(0.78, abs=0.1)
-    assert fall.after == pytest.approx(0.51, abs=0.12)
+    falls = [detector.likeliest(stream) for stream in np.flatnonzero(told)]
+    assert np.median([fall.since for fall in falls]) == pytest.approx(200, abs=15)
+    assert np.median([fall.before for fall in falls]) == pytest.approx(0.78, abs=0.04)
+    assert np.median([fall.after for fall in falls]) == pytest.approx(0.51, abs=0.05)
 
 
 def test_a_rise_is_no_fall_and_bets_are_given_up_beyond_so_many():

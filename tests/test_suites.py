@@ -229,7 +229,7 @@ def test_without_names_policies_of_other_suites_are_left_out():
     toy = find_task("toy:reach").specification
     assert [spec.name for spec in choose_policies(None, toy, POLICIES)] == ["toy_greedy", "toy_reader"]
     assert "local_small" in left_out(toy, POLICIES)
-    assert set(left_out(specification(), POLICIES)) == {"toy_greedy", "toy_reader"}
+    assert set(left_out(specification(), POLICIES)) == {"toy_greedy", "toy_reader", "metaworld_large", "metaworld_small"}
 
 
 @pytest.mark.parametrize(

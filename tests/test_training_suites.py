@@ -15,6 +15,7 @@ from osel_sim.policy.registry import make_policy
 from osel_sim.suites.metaworld.tasks import SPECIFICATION
 from osel_sim.training.annotations import ACTIONS, PLACES, POSITIONS, PRESENT, SIDE_FILE, TARGET
 from osel_sim.training.batches import statistics_of
+from osel_sim.training.collection import check_settings
 from osel_sim.training.dataset import load_demonstrations
 from osel_sim.training.demonstrations import write_shard
 from osel_sim.training.policy_training import Options, train
@@ -114,3 +115,10 @@ def test_act_and_our_own_tasks_say_what_they_do_not_take(demonstrations: Path, t
         train(spec, recipe, [demonstrations], Options(out=tmp_path / "out", threads=1))
     with pytest.raises(SettingError, match="every: is for other suites"):
         osel_sim.collect(task=("lift",), episodes=1, every=4, out=tmp_path / "data")
+
+
+def test_a_dataset_begun_at_every_step_is_not_gone_on_with_at_every_fourth(tmp_path: Path) -> None:
+    check_settings(tmp_path, {"task": "metaworld:drawer-open-v3"})  # as before there was `every`
+    check_settings(tmp_path, {"task": "metaworld:drawer-open-v3", "every": 1})
+    with pytest.raises(UsageError, match="was collected with every = 1, not 4"):
+        check_settings(tmp_path, {"task": "metaworld:drawer-open-v3", "every": 4})

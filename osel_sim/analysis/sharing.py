@@ -35,11 +35,13 @@ class Robots:
         count: of the robots.
         sharing: what they exchange; `none` and `all` are replayed beside it.
         by: what their streams differ in; None: nothing.
+        decisions: length of a stream before it is dealt out; None: all instances.
     """
 
     count: int
     sharing: Sharing
     by: By | None = None
+    decisions: int | None = None
 
     @property
     def ways(self) -> dict[str, Sharing]:
@@ -75,7 +77,6 @@ def share_log(
     selectors: Sequence[str],
     robots: Robots,
     seeds: Sequence[int],
-    decisions: int | None = None,
     workers: int = 1,
     count: Callable[[int], Any] = lambda decisions: None,
     factories: Mapping[str, SelectorFactory] | None = None,
@@ -83,7 +84,7 @@ def share_log(
     """Replay a log to robots that share as asked, to robots that do not, and to one selector for all of them.
 
     Args:
-        log: complete instances only. setup, seeds, decisions, workers, factories: as `osel_sim.analysis.engine` has them.
+        log: complete instances only. setup, seeds, workers, factories: as `osel_sim.analysis.engine` has them.
         selectors: those that can share (`osel_sim.selection.registry.check_can_share`).
         count: called with every job's number of decisions.
 
@@ -94,7 +95,7 @@ def share_log(
         UsageError: too few tasks, levels or arms for so many robots, or streams too short.
     """
     rewards = log.rewards(setup.weights)
-    streams = draw_streams(rewards, seeds, decisions)
+    streams = draw_streams(rewards, seeds, robots.decisions)
     owners = None
     if robots.by is not None:
         values = [getattr(instance, robots.by) for instance in log.instances]

@@ -121,7 +121,7 @@ def _collect_suites(config: CollectConfig, tasks: "list[Task]", axes: dict[str, 
     done = []
     for task, out, seen in zip(tasks, outs, cameras, strict=True):
         kind: dict[str, object] = {"task": task.name, "task_version": task.info.digest, "levels": list(config.level), "axes": axes}
-        kind |= {"every": config.every if config.every > 1 else None}
+        kind |= {"every": config.every}
         collection.check_settings(collection.shards_folder(out), kind | {"image_size": config.image_size, "cameras": list(seen)})
         if collection.seeds(out) == config.episodes:
             done.append(f"{out} is complete")

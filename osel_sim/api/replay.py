@@ -196,8 +196,7 @@ class _Replay:
                     done = self._tell(ReplayResult(config.folder, whole, off_policy), config.folder, part is parts[0])
         if robots is None:
             return done
-        named, asked = robots
-        result[SHARING] = replay_robots(log, here, named, asked, config, self.factories)
+        result[SHARING] = replay_robots(log, here, *robots, config, self.factories)
         write_replay(config.folder, result, choices, tables(result))
         return self._tell(ReplayResult(config.folder, result, off_policy), config.folder, False)
 
@@ -206,7 +205,7 @@ class _Replay:
         from osel_sim.api.replay_changes import changes_asked
         from osel_sim.api.robots import robots_asked
 
-        asked = robots_asked(self.config, selectors, named=self.config.selectors is not None, own=self.factories)
+        asked = robots_asked(self.config, selectors, named=self.config.selectors is not None, own=self.factories, decisions=self.config.decisions)
         if asked is not None and changes_asked(self.config):
             raise UsageError("--robots is for streams that do not change: leave out --join, --leave and --drift, or --robots")
         return asked

@@ -79,13 +79,16 @@ def in_turn(config: "RunConfig", sharing: "Sharing | None", make: "Callable[...,
     return InTurn(Fleet(lambda robot: make(seed=robot_seed(config.seed, robot)), config.robots, sharing))
 
 
-def robots_asked(config: RobotSettings, selectors: Sequence[str], named: bool, own: Collection[str] = ()) -> "tuple[list[str], Robots] | None":
+def robots_asked(
+    config: RobotSettings, selectors: Sequence[str], named: bool, own: Collection[str] = (), decisions: int | None = None
+) -> "tuple[list[str], Robots] | None":
     """Selectors that are replayed to several robots, and what those share; None where there is one robot.
 
     Args:
         selectors: all that are replayed.
         named: whether they were named: then all of them must be able to share.
         own: those that are none of the registry's.
+        decisions: length of a stream; None: all instances.
 
     Raises:
         UsageError: a selector that was named cannot share, or as `sharing_asked`.
@@ -101,7 +104,7 @@ def robots_asked(config: RobotSettings, selectors: Sequence[str], named: bool, o
     check_can_share([name.removesuffix(WARM) for name in wanted if name not in own])
     if not wanted:
         raise UsageError("--robots: name a selector that learns, such as --selectors auto")
-    return wanted, Robots(config.robots, sharing, config.robots_by)
+    return wanted, Robots(config.robots, sharing, config.robots_by, decisions)
 
 
 def replay_robots(
@@ -117,6 +120,6 @@ def replay_robots(
     from osel_sim.core.progress import progress
 
     seeds = range(config.seeds)
-    total = share_total(robots, selectors, config.seeds, config.decisions or len(log))
+    total = share_total(robots, selectors, config.seeds, robots.decisions or len(log))
     with progress(total, "decision of robots", scale=True) as bar:
-        return share_log(log, setup, selectors, robots, seeds, config.decisions, config.workers, bar.update, factories)
+        return share_log(log, setup, selectors, robots, seeds, config.workers, bar.update, factories)

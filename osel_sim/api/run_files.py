@@ -41,16 +41,22 @@ def _comparison(live: "LiveRun", chosen: list[int]) -> dict[str, Any]:
 
     from osel_sim.selection.oracle import compare
 
-    rewards, policies = live.rewards, live.policies
-    complete = np.isfinite(rewards).all(axis=1)
+    received, policies = live.rewards, live.policies
+    rewards = received.copy()
+    for row, alone in enumerate(live.alone):  # a policy that always drives has no monitor; what was received had one
+        rewards[row, chosen[row]] = np.nan if alone is None else alone
+    complete = np.isfinite(rewards).all(axis=1) & np.isfinite(received).all(axis=1)
     if not complete.any():
         return {}
-    result = compare(rewards, chosen)
+    rewards, received = rewards[complete], received[complete]
+    columns = np.array(chosen)[complete]
+    result = compare(rewards, columns.tolist())
+    mean_received = float(received[np.arange(len(columns)), columns].mean())
     return {
         "compared_decisions": result.instances,
         "best_single": result.best_single_reward,
         "best_single_policy": policies[result.best_single],
         "hindsight_oracle": result.hindsight_oracle,
-        "regret": result.regret,
-        "always": dict(zip(policies, rewards[complete].mean(axis=0).tolist(), strict=True)),
+        "regret": result.regret if not live.alone else result.hindsight_oracle - mean_received,
+        "always": dict(zip(policies, rewards.mean(axis=0).tolist(), strict=True)),
     }

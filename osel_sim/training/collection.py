@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 SHARD = 20
+UNSAID = {"every": 1}
+"""Settings of folders that were begun before there were such."""
 
 
 def shards_folder(out: Path) -> Path:
@@ -43,8 +45,8 @@ def check_settings(folder: Path, settings: dict[str, object]) -> None:
     if file.is_file():
         before = read_json(file)
         for key, value in settings.items():
-            if before.get(key) != value:
-                raise UsageError(f"{folder}: was collected with {key} = {before.get(key)!r}, not {value!r}")
+            if (earlier := before.get(key, UNSAID.get(key))) != value:
+                raise UsageError(f"{folder}: was collected with {key} = {earlier!r}, not {value!r}")
     write_text(file, json.dumps(settings))
 
 
