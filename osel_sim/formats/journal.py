@@ -94,7 +94,7 @@ class Decision:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "Decision":
         """Raises TypeError or KeyError if a field is missing or unknown."""
-        monitored = {"monitored": Monitored.from_dict(data["monitored"])} if "monitored" in data else {}
+        monitored = {"monitored": Monitored.from_dict(data["monitored"])} if data.get("monitored") is not None else {}
         return cls(**{**data, "seconds": Seconds(**data["seconds"]), **monitored})
 
 

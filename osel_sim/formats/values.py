@@ -87,7 +87,7 @@ DECISION = {
     **{"index": COUNT, "task": NAME, "seed": COUNT, "level": COUNT, "axes": NAME.or_null, "split": NAME},
     **{"instruction": TEXT, "phrasing": TEXT, "target": TEXT, "container": TEXT, "policy": NAME, "propensities": PROPENSITIES},
     **{**_END, "seconds": SECONDS, **_USED, "reward": NUMBER.or_null, **_TOLD, "robot": NAME.or_null, "scene": NAME.or_null},
-    "monitored": MONITORED,
+    "monitored": MONITORED.or_null,
 }
 """Of `osel_sim.formats.journal.Decision`."""
 ROW = {
