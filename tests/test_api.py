@@ -18,8 +18,8 @@ from osel_sim.interface.selector import Choice
 class Greedy:
     """A selector of one's own: all that it needs."""
 
-    def __init__(self, policies, context_dim, seed):
-        self.policies, self.mean = tuple(policies), {}
+    def __init__(self, names, length, number):
+        self.policies, self.mean = tuple(names), {}
 
     def select(self, context):
         best = max(self.policies, key=lambda policy: self.mean.get(policy, 9.0))

@@ -15,6 +15,7 @@ from osel_sim.core.errors import DataError, UsageError
 from osel_sim.episodes.drivers import Drivers, choose_policies
 from osel_sim.episodes.live import LiveOptions, LiveRun
 from osel_sim.formats.journal import JOURNAL, read_journal
+from osel_sim.interface.selector import Choice
 from osel_sim.selection.dealing import deal, groups
 from osel_sim.selection.fleet import Fleet, InTurn, Sharing, members
 from osel_sim.selection.registry import make_selector
@@ -103,6 +104,7 @@ def toy(tmp_path, monkeypatch):
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-suite\nVersion: 1.0\n")
     points = "[osel_sim.suites]\ntoy = toy_suite:Toy\n[osel_sim.policies]\ntoy_greedy = toy_policies:load_greedy\n"
+    points += "[osel_sim.encoders]\ncolour = test_fleet:Colour\n"
     (info / "entry_points.txt").write_text(points)
     for folder in (TOY, info.parent):
         monkeypatch.syspath_prepend(str(folder))
@@ -153,6 +155,31 @@ def test_robots_of_a_live_run_have_their_own_tasks(toy, tmp_path):
     tasks = [decision.task for decision in read_journal(tmp_path / "run" / JOURNAL)]
     assert tasks == ["toy:hurry", "toy:reach"] * 4
     assert len(members(live.selector)) == 2
+
+
+class Alternating:
+    """A selector of one's own: it chooses and learns, and knows nothing of states, prices or other robots."""
+
+    def __init__(self, names, length, number):
+        self.policies, self.learned = tuple(names), 0
+
+    def select(self, context):
+        chosen = self.policies[self.learned % len(self.policies)]
+        return Choice(chosen, {name: float(name == chosen) for name in self.policies})
+
+    def update(self, context, choice, reward):
+        self.learned += 1
+
+
+@pytest.mark.parametrize("settings", [{}, {"robots": 2, "share": "all"}, {"robots": 2, "share": "none"}, {"budget_cents": 5}])
+def test_a_selector_of_ones_own_runs_alone_on_several_robots_and_within_a_budget(toy, tmp_path, settings):
+    common = {"task": "toy:reach", "policies": ["toy_greedy", osel.as_policy(Still(), "still", cameras=["top"], image_size=64, execute=4)]}
+    common |= {"policies_dir": TOY / "policies", "encoder": "colour", "no_page": True, "episodes": 4, "selector": Alternating}
+    found = osel.run(out=tmp_path / "run", **common, **settings)
+    assert len(found.decisions) == 4 and found.summary["decisions"] == 4
+    with pytest.raises(UsageError, match="Alternating cannot share"):
+        osel.run(out=tmp_path / "shared", robots=2, **common)
+    assert not (tmp_path / "shared").exists()
 
 
 def test_settings_of_several_robots_are_said_in_the_configuration():

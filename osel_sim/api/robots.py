@@ -66,7 +66,7 @@ def fleet_said(config: RobotSettings, sharing: "Sharing | None") -> dict[str, An
     return {"fleet": {"robots": config.robots, "share": str(sharing), "delay": sharing.delay, "by": config.robots_by}}
 
 
-def in_turn(config: "RunConfig", sharing: "Sharing | None", make: "Callable[..., Selector]") -> "Selector":
+def in_turn(config: "RunConfig", sharing: "Sharing | None", make: "Callable[[int], Selector]") -> "Selector":
     """The selector of a live run, or those of several robots as one.
 
     Args:
@@ -75,8 +75,8 @@ def in_turn(config: "RunConfig", sharing: "Sharing | None", make: "Callable[...,
     from osel_sim.selection.fleet import Fleet, InTurn, robot_seed
 
     if sharing is None:
-        return make(seed=config.seed)
-    return InTurn(Fleet(lambda robot: make(seed=robot_seed(config.seed, robot)), config.robots, sharing))
+        return make(config.seed)
+    return InTurn(Fleet(lambda robot: make(robot_seed(config.seed, robot)), config.robots, sharing))
 
 
 def robots_asked(

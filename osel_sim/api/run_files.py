@@ -15,6 +15,8 @@ def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
 
     from osel_sim.core.files import write_json
     from osel_sim.formats.summary import SUMMARY, summarise
+    from osel_sim.selection.budget import Budgeted
+    from osel_sim.selection.fleet import members
     from osel_sim.selection.state import save_state
 
     if not live.decisions:
@@ -30,7 +32,9 @@ def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     if known:
         summary["monitor"] |= {"compared_decisions": len(known), "with": mean([one for one, _ in known]), "without": mean([one for _, one in known])}
     write_json(live.folder / SUMMARY, summary)
-    if hasattr(live.selector, "state_dict"):  # a selector of one's own need only choose and learn; a resumed run learns from the journal anyway
+    within = live.selector.inner if isinstance(live.selector, Budgeted) else live.selector
+    # A selector of one's own need only choose and learn; a resumed run learns from the journal anyway.
+    if all(hasattr(selector, "state_dict") for selector in members(within)):
         save_state(live.selector.state_dict(), live.folder / "selector.safetensors")
     return summary
 

@@ -73,6 +73,8 @@ class Fleet:
         self.sharing, self.robots = sharing, robots
         one = make(0)
         self.selectors = [one] * robots if sharing.central else [one, *(make(robot) for robot in range(1, robots))]
+        if sharing.every is not None:
+            self._members()
         self._rounds = 0
         self._decided: list[tuple[int, Context, Choice, float]] = []  # in this round, not yet learned from
         self._under_way: list[tuple[int, list[State]]] = []  # from which round on it is known, what was shared
