@@ -255,11 +255,12 @@ def dual_price(expected: Array, prices: Array, pace: float) -> float:
     """
     cheapest = int(prices.argmin())
     dearer = prices > prices[cheapest]
+    by_policy, cents = np.ascontiguousarray(expected.T), prices[:, None]  # numpy goes through a few long rows more than twice as fast
 
     def cost(dual: float) -> float:
-        scores = expected - dual * prices
-        best = scores >= scores.max(axis=1, keepdims=True) - 1e-12
-        return float(np.where(best, prices, np.inf).min(axis=1).mean())
+        scores = by_policy - dual * cents
+        best = scores >= scores.max(axis=0) - 1e-12
+        return float(np.where(best, cents, np.inf).min(axis=0).mean())
 
     if not dearer.any() or cost(0.0) <= pace:
         return 0.0
