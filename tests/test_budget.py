@@ -10,11 +10,14 @@ from synthetic_log import make_row, write_log
 import osel_sim as osel
 from osel_sim.analysis.budgets import best_within
 from osel_sim.core.errors import BudgetError, DataError, SettingError, UsageError
+from osel_sim.episodes.changes import apply
 from osel_sim.episodes.most_costs import most_costs
 from osel_sim.formats import library
 from osel_sim.formats.budget import read_budget
 from osel_sim.formats.journal import read_journal
 from osel_sim.formats.merged_policy import merged
+from osel_sim.formats.policy_changes import PolicyChange
+from osel_sim.interface.selector import Choice
 from osel_sim.reporting.budget_section import run_budget
 from osel_sim.run import main as run_main
 from osel_sim.selection.budget import Budget, Budgeted, dual_price
@@ -100,6 +103,50 @@ def test_every_selector_keeps_to_it_period_by_period_and_goes_on_from_its_state(
     second = budgeted(name, 4.0, 12)
     second.load_state_dict(first.state_dict())
     assert (play(second, contexts[15:], rewards[15:], prices[15:]) == chosen[15:]).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_policies_come_and_go_within_a_budget(name):
+    paid = {"local": 0.0, "remote": 1.8, "new": 0.9}
+    budget = Budget(4.0, 12, {"local": 0.0, "remote": 2.0, "new": 1.0})
+    selector = Budgeted(make_selector(name, POLICIES, 4, 0, **SETTINGS.get(name, {})), budget, 4, 0)
+    changes = {8: "add", 14: "retire", 20: "add"}
+    spent = []
+    for index, context in enumerate(np.random.default_rng(3).normal(size=(24, 4)).astype(np.float32)):
+        if index in changes:
+            apply(selector, PolicyChange(index, changes[index], "new", {}), {})
+        choice = selector.select(context)
+        assert tuple(choice.propensities) == selector.policies == (*POLICIES, *(["new"] if 8 <= index < 14 or index >= 20 else []))
+        spent.append(paid[choice.policy])
+        selector.pay(choice.policy, spent[-1])
+        selector.update(context, choice, float(choice.policy != "local"))
+    assert max(sum(spent[:12]), sum(spent[12:])) <= 4.0
+
+
+class InTurn:
+    """A selector of one's own: it tells nothing of what it expects, and keeps what it is taught."""
+
+    policies = POLICIES
+
+    def __init__(self) -> None:
+        self.taught: list[float] = []
+
+    def select(self, context):
+        return Choice(POLICIES[len(self.taught) % 2], dict.fromkeys(POLICIES, 0.5))
+
+    def update(self, context, choice, reward):
+        self.taught.append(reward)
+
+
+def test_one_that_tells_no_expectations_learns_rewards_less_what_their_cents_are_worth():
+    contexts, _, _, rewards, prices = knapsack(200)
+    inner = InTurn()
+    selector = Budgeted(inner, Budget(40.0, 200, {"local": 0.0, "remote": 1.0}), 4, 0)
+    chosen = play(selector, contexts, rewards, prices)
+    assert chosen.tolist() == [index % 2 if index < 80 else 0 for index in range(200)]  # then there are no cents left
+    came = rewards[np.arange(81), chosen[:81]] - np.array(selector.duals[:81]) * chosen[:81]
+    assert inner.taught == pytest.approx(came.tolist())  # and not what came of choices that were not its own
+    assert max(selector.duals[1:80:2]) > 0.1
 
 
 def test_what_a_budget_refuses():

@@ -350,11 +350,23 @@ def test_parts_that_are_none(parts):
         make_selector("auto", ("a", "b"), 40, seed=0, parts=parts)
 
 
-def test_a_change_that_nobody_announced_is_noticed_and_what_was_before_forgotten():
+def worsening():
+    """Contexts that say nothing, and rewards of three policies, of which the first is the best for 400 decisions and then the worst."""
     generator = np.random.default_rng(0)
     contexts = generator.normal(size=(700, 8)).astype(np.float32)
     rates = np.where(np.arange(700)[:, None] < 400, [0.8, 0.5, 0.4], [0.2, 0.5, 0.4])
-    rewards = (generator.random(rates.shape) < rates).astype(float)
+    return contexts, (generator.random(rates.shape) < rates).astype(float)
+
+
+def test_a_change_is_noticed_between_two_fits():
+    contexts, rewards = worsening()
+    selector = make_selector("auto", POLICIES, 8, seed=0)
+    play(selector, contexts[:440], rewards[:440])  # fits come after 362 and 453 decisions
+    assert len(selector.state_dict()["targets"]) < 80
+
+
+def test_a_change_that_nobody_announced_is_noticed_and_what_was_before_forgotten():
+    contexts, rewards = worsening()
     late = {}
     for alarm in (1e4, math.inf):
         selector = make_selector("auto", POLICIES, 8, seed=0, alarm=alarm)

@@ -3,7 +3,7 @@
 import contextlib
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -317,8 +317,9 @@ class _Run:
             changes=self._changes(encoder, selector),
             # What a merge costs depends on whose answers there were.
             prices={spec.name: spec.price for spec in (*self.policies, *self.plan.joined.values()) if spec.kind != MERGE},
+            robots=config.robots,
+            robots_by=config.robots_by,
         )
-        options = replace(options, robots=config.robots, robots_by=config.robots_by)
         monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
         return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder), monitor)
 
