@@ -361,7 +361,7 @@ def worsening():
 def test_a_change_is_noticed_between_two_fits():
     contexts, rewards = worsening()
     selector = make_selector("auto", POLICIES, 8, seed=0)
-    play(selector, contexts[:440], rewards[:440])  # fits come after 362 and 453 decisions
+    play(selector, contexts[:440], rewards[:440])  # fits come after 363 and 454 decisions
     assert len(selector.state_dict()["targets"]) < 80
 
 
