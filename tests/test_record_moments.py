@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_helpers import command, environment, execute, make_world, wait_for_lines
+from run_helpers import command, environment, execute, wait_for_lines
 
 from osel_sim.episodes.moment_recording import MOMENT_SHARDS
 from osel_sim.formats.journal import JOURNAL, read_lines, to_decision
@@ -18,15 +18,6 @@ from osel_sim.record import main as record_main
 from osel_sim.run import main as run_main
 
 SIZE = ("--instances", 2, "--action-noise", 0.05, "--moments", 1, "--most-moments", 2)
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])  # of servers that are started from here
-        yield folder
 
 
 @pytest.fixture(scope="module")
