@@ -54,8 +54,8 @@ def replay_moments(
     from osel_sim.analysis.moment_result import Question, study
     from osel_sim.analysis.moment_tables import tables
     from osel_sim.api.replay_settings import choose_selectors
-    from osel_sim.formats.moments_result import write_moments_result
-    from osel_sim.formats.replay_result import check_replay_folder
+    from osel_sim.formats.moments_result import MOMENTS_RESULT, write_moments_result
+    from osel_sim.formats.replay_result import check_replay_folder, drop_others
 
     for name in _NOT_HERE:
         if name in config.given:
@@ -77,6 +77,7 @@ def replay_moments(
     result["log"] = {"folder": str(config.log), "encoder": log.whole.encoder, "half": config.half or "score", "preset": preset}
     result["log"] |= {"every": metadata["every"], "most": metadata["most"], "moments": int(log.there.sum()), "about": about}
     write_moments_result(config.folder, result, tables(result))
+    drop_others(config.folder, MOMENTS_RESULT)
     if config.open:
         from osel_sim.api.report import report
 
