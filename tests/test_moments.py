@@ -19,10 +19,11 @@ from osel_sim.analysis.moment_oracles import gains_at, oracles_of
 from osel_sim.analysis.units import units_of
 from osel_sim.api.replay import replay
 from osel_sim.api.report import report
-from osel_sim.core.errors import DataError, OselError, SettingError
+from osel_sim.core.errors import DataError, OselError, SettingError, UsageError
 from osel_sim.formats.moments import MOMENTS, SEEN, MomentRow, read_moments, write_moments
 from osel_sim.formats.moments_result import MOMENTS_RESULT
 from osel_sim.formats.replay_result import REPLAY
+from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.selection.reward import preset
 
 WEIGHTS = preset("oxe")
@@ -240,6 +241,23 @@ def test_settings_of_other_replays_are_refused(folder: Path, replayed: Path, tmp
         replay(folder, decisions=10, out=tmp_path / "new")
     with pytest.raises(OselError, match="holds a replay"):
         replay(folder, out=replayed)
+
+
+def test_a_table_with_nobody_to_hand_over_to_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="with local alone there is nobody to hand over to"):
+        replay(folder, policies=["local"], out=tmp_path / "new")
+
+
+def test_a_table_without_an_outcome_of_some_policy_is_refused(tmp_path: Path) -> None:
+    log = stuck_log(tmp_path / "log", instances=20, repeats=1)
+    rows, about = read_rollouts(log)
+    failed = [replace(row, error="down") if row.policy == "remote" else row for row in rows]
+    write_rollouts(log, failed, {key: about[key] for key in ("encoder", "policies")})
+    table = read_moments(log)
+    moments = [replace(row, error="down") if "remote" in (row.first, row.second) else row for row in table.rows]
+    write_moments(log, moments, table.seen, {key: value for key, value in table.metadata.items() if key not in ("schema_version", "seen_sha256")})
+    with pytest.raises(DataError, match="remote has no outcome on any of"):
+        replay(log, out=tmp_path / "new")
 
 
 def test_the_shipped_table_is_of_its_log() -> None:
