@@ -228,6 +228,6 @@ def test_a_replay_s_budget_that_pays_for_nothing_is_refused(tmp_path):
         osel.replay(log, budget_cents=4, join="remote@5", out=tmp_path / "none", **common)
     with pytest.raises(SettingError, match="budget_per: is the number of decisions"):
         osel.replay(log, budget_per=4, out=tmp_path / "none", **common)
-    found = osel.replay(log, budget_cents=4, out=tmp_path / "out", **common).result["budget"]
-    assert found["cents"][0] == 1.0
+    found = osel.replay(log, budget_cents=4, decisions=20, out=tmp_path / "out", **common).result["budget"]
+    assert (found["cents"][0], found["period"], found["decisions"]) == (1.0, 20, 20)
     assert 0.0 < found["selectors"]["thompson"][2]["made"] < 1.0  # some decisions could not be paid
