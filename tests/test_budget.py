@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from run_helpers import HORIZON, environment, make_world
+from run_helpers import HORIZON
 from synthetic_log import make_row, write_log
 
 import osel_sim as osel
@@ -115,15 +115,6 @@ def test_what_a_budget_refuses():
     paid.pay("remote", 2.5)
     with pytest.raises(BudgetError, match=r"0\.5 cents are left of 3"):
         paid.select(np.zeros(4, np.float32))
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])
-        yield folder
 
 
 def arguments(world, *more) -> list[str]:

@@ -6,7 +6,7 @@ import shutil
 from pathlib import Path
 
 import pytest
-from run_helpers import command, environment, make_world
+from run_helpers import command
 
 import osel_sim as osel
 from osel_sim.context.cache import ContextCache
@@ -19,15 +19,6 @@ from osel_sim.merge import main as merge_main
 from osel_sim.record import main as record_main
 
 FLAGS = ("--instances", 5, "--start-seed", 40, "--level", 0, 2, "--repeats", 2, "--repeat-every", 2, "--policies", "calm", "--workers", 1)
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])
-        yield folder
 
 
 def record(world: Path, *flags: object) -> int:
