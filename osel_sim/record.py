@@ -66,7 +66,11 @@ def _print_decision(result: "RecordResult") -> None:
 def _print_next(folder: Path) -> None:
     from osel_sim.api.replay_moments import has_moments
     from osel_sim.cli.next_step import print_next
+    from osel_sim.formats.run_config import read_run
 
+    if read_run(folder)["configuration"].get("shard"):
+        print_next(("puts it together with the others", "merge", [folder, "OTHER_SHARDS", "--out", "LOG"]))
+        return
     if has_moments(folder):
         print_next(("compares monitors on it: is it worth handing over?", "replay", [folder]), ("makes a page of it", "report", [folder, "--open"]))
         return
