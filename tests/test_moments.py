@@ -6,8 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet
 import pytest
-from synthetic_moments import POLICIES, stuck_log
+from synthetic_moments import ENCODER, POLICIES, stuck_log
 
 from osel_sim.analysis.equal_duty import blind_arms, random_arm
 from osel_sim.analysis.handovers import Handovers, blind, by_chance, first_turns, never, outcomes, recovered_and_harmed
@@ -20,7 +21,9 @@ from osel_sim.analysis.units import units_of
 from osel_sim.api.replay import replay
 from osel_sim.api.report import report
 from osel_sim.core.errors import DataError, OselError, SettingError, UsageError
-from osel_sim.formats.moments import MOMENTS, SEEN, MomentRow, read_moments, write_moments
+from osel_sim.episodes.moment_recording import MOMENT_SHARDS, MomentRecording
+from osel_sim.episodes.moments import Cuts, Moments
+from osel_sim.formats.moments import MOMENTS, SEEN, SIGNALS, MomentRow, read_moments, write_moments
 from osel_sim.formats.moments_result import MOMENTS_RESULT
 from osel_sim.formats.replay_result import REPLAY
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
@@ -265,3 +268,26 @@ def test_the_shipped_table_is_of_its_log() -> None:
     assert log.policies == ("local_small", "remote_large", "remote_specialist") and log.calls == (6, 12, 18)
     assert log.remote.tolist() == [False, True, True]
     assert np.isfinite(log.ways["success"][log.there]).all()
+
+
+def test_a_table_that_grows_loses_nothing_where_it_is_cut_off(tmp_path, monkeypatch):
+    """Its two files change one after the other, and then no longer belong together."""
+    folder, cuts, about = stuck_log(tmp_path / "log", instances=3), Cuts(4, 2), {"policies": list(POLICIES), "remote": ["remote"], "encoder": ENCODER}
+    table = read_moments(folder)
+    (instance, first, _), own = table.rows[0].moment[:3], [row for row in table.rows if row.moment[:3] == table.rows[0].moment[:3]]
+    more = Moments(tuple(replace(row, repeat=9) for row in own), np.ones((2, 8), np.float32), np.zeros((2, len(SIGNALS))))
+    episodes = [*dict.fromkeys(row.moment[:3] for row in table.rows), (instance, first, 9)]
+
+    def killed(*arguments, **settings):
+        raise KeyboardInterrupt
+
+    recording = MomentRecording(folder)
+    recording.add({(instance, first, 9): more})
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pyarrow.parquet, "write_table", killed)
+        recording.finish(episodes, cuts, about)
+    MomentRecording(folder).finish(episodes, cuts, about)
+    grown = read_moments(folder)
+    assert list(grown.rows) == [*table.rows, *more.rows]
+    np.testing.assert_array_equal(grown.seen.pictures, np.concatenate([table.seen.pictures, more.pictures]))
+    assert not (folder / MOMENT_SHARDS).exists()
