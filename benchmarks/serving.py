@@ -30,7 +30,6 @@ def serving(policy: str, *flags: str) -> Iterator[str]:
     command = [sys.executable, "-m", "osel_sim.serve", policy, "--port", "0", *flags]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, TOKEN_VARIABLE: TOKEN})
     try:
-        assert server.stdout is not None
         yield json.loads(server.stdout.readline())["url"]
     finally:
         server.terminate()

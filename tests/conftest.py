@@ -3,6 +3,8 @@
 import gc
 import os
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -26,3 +28,15 @@ def pytest_collection_finish() -> None:
 def sb3_logs(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Where stable-baselines3 makes a folder whenever something learns, though it logs nothing."""
     os.environ["SB3_LOGDIR"] = str(tmp_path_factory.mktemp("sb3"))
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The folder that `make_world` makes, its plugin installed here and for the processes that are started from here."""
+    from run_helpers import environment, make_world
+
+    with pytest.MonkeyPatch.context() as patch:
+        folder = make_world(tmp_path_factory.mktemp("world"))
+        patch.syspath_prepend(str(folder / "plugin"))
+        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])
+        yield folder

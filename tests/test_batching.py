@@ -18,7 +18,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from remote_helpers import ENVIRONMENT, GREETING, TOKEN, Sinusoid, observation, serving
 
 from osel_sim.api.serve import ServeConfig, serve
-from osel_sim.core.errors import RemoteError, SettingError
+from osel_sim.core.errors import PolicyError, RemoteError, SettingError
 from osel_sim.formats import library
 from osel_sim.policy.batched import act_together, why_not_together
 from osel_sim.policy.language_chunk import LanguageChunkConfig, LanguageChunkPolicy
@@ -92,6 +92,11 @@ def test_checkpoints_answer_together_what_they_answer_alone(tmp_path, kind):
         session.reset(one["task"])
     answers = act_together(sessions, shown)
     assert max(np.abs(one - other).max() for one, other in itertools.pairwise(answers)) > 1e-3, "they are asked different things"
+    before = [session._calls for session in sessions]
+    histories = [{key: value if key == "task" else np.stack([value, value]) for key, value in one.items()} for one in shown]
+    with pytest.raises(PolicyError, match="several observations"):
+        type(sessions[0]).act_batch(sessions, [*shown[:-1], histories[-1]])
+    assert [session._calls for session in sessions] == before, "none has changed where it raises"
 
 
 def test_a_shipped_checkpoint_answers_together_what_it_answers_alone():

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from run_helpers import HORIZON, environment, make_world
+from run_helpers import HORIZON
 from synthetic_log import make_row, write_log
 
 import osel_sim as osel
@@ -164,15 +164,6 @@ def test_what_a_budget_refuses():
         paid.select(np.zeros(4, np.float32))
 
 
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])
-        yield folder
-
-
 def arguments(world, *more) -> list[str]:
     fixed = ["--task", "short", "--tasks", world / "tasks", "--policies-dir", world / "policies", "--encoder", "colours", "--no-page"]
     return [str(word) for word in (*fixed, *more)]
@@ -284,6 +275,6 @@ def test_a_replay_s_budget_that_pays_for_nothing_is_refused(tmp_path):
         osel.replay(log, budget_cents=4, join="remote@5", out=tmp_path / "none", **common)
     with pytest.raises(SettingError, match="budget_per: is the number of decisions"):
         osel.replay(log, budget_per=4, out=tmp_path / "none", **common)
-    found = osel.replay(log, budget_cents=4, out=tmp_path / "out", **common).result["budget"]
-    assert found["cents"][0] == 1.0
+    found = osel.replay(log, budget_cents=4, decisions=20, out=tmp_path / "out", **common).result["budget"]
+    assert (found["cents"][0], found["period"], found["decisions"]) == (1.0, 20, 20)
     assert 0.0 < found["selectors"]["thompson"][2]["made"] < 1.0  # some decisions could not be paid

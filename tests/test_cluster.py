@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from run_helpers import command, environment, make_world
+from run_helpers import command
 
 from osel_sim.core.engines import make_engine, options_of
 from osel_sim.core.errors import MissingPackageError, SettingError
@@ -16,12 +16,10 @@ FLAGS = ("--instances", 3, "--start-seed", 40, "--policies", "calm", "--workers"
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory):
+def world(world):
     with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", os.pathsep.join([environment(folder)["PYTHONPATH"], *sys.path]))  # of jobs, which are processes of their own
-        yield folder
+        patch.setenv("PYTHONPATH", os.pathsep.join([os.environ["PYTHONPATH"], *sys.path]))  # of jobs, which are processes of their own
+        yield world
 
 
 def record(world: Path, *flags: object) -> int:

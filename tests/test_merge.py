@@ -6,12 +6,15 @@ import shutil
 from pathlib import Path
 
 import pytest
-from run_helpers import command, environment, make_world
+from run_helpers import command
 
 import osel_sim as osel
+from osel_sim.api.record_cluster import SETTINGS, is_for_cluster
+from osel_sim.api.record_settings import RecordConfig
 from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import OselError, SettingError
 from osel_sim.core.holding import held
+from osel_sim.episodes.merging import PARTS
 from osel_sim.episodes.shard import Shard
 from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.formats.shards import Shards
@@ -19,15 +22,6 @@ from osel_sim.merge import main as merge_main
 from osel_sim.record import main as record_main
 
 FLAGS = ("--instances", 5, "--start-seed", 40, "--level", 0, 2, "--repeats", 2, "--repeat-every", 2, "--policies", "calm", "--workers", 1)
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])
-        yield folder
 
 
 def record(world: Path, *flags: object) -> int:
@@ -160,6 +154,17 @@ def test_shards_that_do_not_fit_together_are_refused_by_name(recorded, shards, t
     rows, metadata = read_rollouts(second)
     write_rollouts(second, rows[:-1], {key: value for key, value in metadata.items() if key != "schema_version"})
     assert "shard 2/2, is not finished" in refused(first, second)
+
+
+def test_a_recording_on_a_cluster_goes_on_as_one_until_all_is_put_together(tmp_path):
+    (tmp_path / PARTS).mkdir()
+    (tmp_path / PARTS / SETTINGS).touch()
+    again = RecordConfig.of(out=tmp_path, resume=True)
+    assert is_for_cluster(again)
+    (tmp_path / "run.json").touch()
+    assert is_for_cluster(again), "it was killed while it merged"
+    (tmp_path / "rollouts.parquet").touch()
+    assert not is_for_cluster(again)
 
 
 @pytest.mark.parametrize(

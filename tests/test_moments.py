@@ -6,20 +6,27 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet
 import pytest
-from synthetic_moments import POLICIES, stuck_log
+from synthetic_moments import ENCODER, POLICIES, stuck_log
 
 from osel_sim.analysis.equal_duty import blind_arms, random_arm
-from osel_sim.analysis.handovers import blind, by_chance, driven_steps, first_turns, never, outcomes, recovered_and_harmed
+from osel_sim.analysis.handovers import Handovers, blind, by_chance, first_turns, never, outcomes, recovered_and_harmed
 from osel_sim.analysis.learned_handovers import learned_turns
+from osel_sim.analysis.log import Array
+from osel_sim.analysis.moment_arms import values_of
 from osel_sim.analysis.moment_log import MomentLog, read_moment_log
 from osel_sim.analysis.moment_oracles import gains_at, oracles_of
 from osel_sim.analysis.units import units_of
 from osel_sim.api.replay import replay
 from osel_sim.api.report import report
-from osel_sim.core.errors import DataError, OselError, SettingError
-from osel_sim.formats.moments import MOMENTS, SEEN, MomentRow, read_moments, write_moments
+from osel_sim.core.errors import DataError, OselError, SettingError, UsageError
+from osel_sim.episodes.moment_recording import MOMENT_SHARDS, MomentRecording
+from osel_sim.episodes.moments import Cuts, Moments
+from osel_sim.formats.moments import MOMENTS, SEEN, SIGNALS, MomentRow, read_moments, write_moments
 from osel_sim.formats.moments_result import MOMENTS_RESULT
+from osel_sim.formats.replay_result import REPLAY
+from osel_sim.formats.rollout_log import read_rollouts, write_rollouts
 from osel_sim.selection.reward import preset
 
 WEIGHTS = preset("oxe")
@@ -138,13 +145,33 @@ def test_recovered_and_harmed_are_of_what_the_first_policy_alone_does(log: Momen
 
 
 def test_arms_without_looking_have_the_duty_that_is_asked_for(log: MomentLog) -> None:
-    share = np.tile([1.0, 0.0], (len(log), 1))[:, :, None]
+    share = np.tile([1.0, 0.0], (len(log), 1))
     for arm in [*blind_arms(log, 0.4, share), random_arm(log, 0.4, share)]:
         assert arm is not None
-        steps, remote = driven_steps(outcomes(log, arm.handovers), share)
-        assert remote / steps == pytest.approx(0.4, abs=1e-3)
+        assert _duty(log, arm.handovers, share) == pytest.approx(0.4, abs=1e-3)
     assert {arm.name for arm in blind_arms(log, 0.4, share)} == {"blind:8:remote or blind:4:remote"}
     assert random_arm(log, 0.9, share) is None  # even at the first point it is too late for so much
+
+
+def test_instances_count_alike_in_duty_however_often_they_were_repeated(log: MomentLog) -> None:
+    """As in the duty of the monitor that the arms are set against."""
+    gone = np.zeros(log.there.shape[:3], bool)
+    gone[::2, :, 1] = True
+    whole = {name: np.where(gone, np.nan, getattr(log.whole, name)) for name in ("success", "subgoals", "steps", "price")}
+    ways = {name: np.where(gone[..., None, None], np.nan, values) for name, values in log.ways.items()}
+    fewer = replace(log, whole=replace(log.whole, **whole), ways=ways, seen_at=np.where(gone[..., None], -1, log.seen_at))
+    share = np.tile(np.eye(2), (len(log) // 2, 1))  # the remote policy begins where nothing is missing
+    arms = [*blind_arms(fewer, 0.6, share), random_arm(fewer, 0.6, share)]
+    assert len(arms) > 1
+    for arm in arms:
+        assert arm is not None
+        assert _duty(fewer, arm.handovers, share) == pytest.approx(0.6, abs=1e-3)
+
+
+def _duty(log: MomentLog, handovers: Handovers, share: Array) -> float:
+    """As a replay reports it."""
+    measures = values_of(log, share, handovers, WEIGHTS).measures
+    return float(np.nansum(measures["remote_steps"]) / np.nansum(measures["steps"]))
 
 
 # -- what can be learned -----------------------------------------------------------------------------------------------------------------
@@ -183,7 +210,9 @@ def test_gains_are_of_the_same_states(log: MomentLog) -> None:
 @pytest.fixture(scope="module")
 def replayed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("replayed") / "out"
-    replay(folder, selectors=["auto:warm"], seeds=2, workers=1, out=out)
+    out.mkdir()
+    (out / REPLAY).write_text("{}")  # of another replay, which this one replaces
+    replay(folder, selectors=["auto:warm"], seeds=2, workers=1, out=out, overwrite=True)
     return out
 
 
@@ -217,8 +246,48 @@ def test_settings_of_other_replays_are_refused(folder: Path, replayed: Path, tmp
         replay(folder, out=replayed)
 
 
+def test_a_table_with_nobody_to_hand_over_to_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="with local alone there is nobody to hand over to"):
+        replay(folder, policies=["local"], out=tmp_path / "new")
+
+
+def test_a_table_without_an_outcome_of_some_policy_is_refused(tmp_path: Path) -> None:
+    log = stuck_log(tmp_path / "log", instances=20, repeats=1)
+    rows, about = read_rollouts(log)
+    failed = [replace(row, error="down") if row.policy == "remote" else row for row in rows]
+    write_rollouts(log, failed, {key: about[key] for key in ("encoder", "policies")})
+    table = read_moments(log)
+    moments = [replace(row, error="down") if "remote" in (row.first, row.second) else row for row in table.rows]
+    write_moments(log, moments, table.seen, {key: value for key, value in table.metadata.items() if key not in ("schema_version", "seen_sha256")})
+    with pytest.raises(DataError, match="remote has no outcome on any of"):
+        replay(log, out=tmp_path / "new")
+
+
 def test_the_shipped_table_is_of_its_log() -> None:
     log = read_moment_log(Path(__file__).parent.parent / "assets" / "logs" / "moments")
     assert log.policies == ("local_small", "remote_large", "remote_specialist") and log.calls == (6, 12, 18)
     assert log.remote.tolist() == [False, True, True]
     assert np.isfinite(log.ways["success"][log.there]).all()
+
+
+def test_a_table_that_grows_loses_nothing_where_it_is_cut_off(tmp_path, monkeypatch):
+    """Its two files change one after the other, and then no longer belong together."""
+    folder, cuts, about = stuck_log(tmp_path / "log", instances=3), Cuts(4, 2), {"policies": list(POLICIES), "remote": ["remote"], "encoder": ENCODER}
+    table = read_moments(folder)
+    (instance, first, _), own = table.rows[0].moment[:3], [row for row in table.rows if row.moment[:3] == table.rows[0].moment[:3]]
+    more = Moments(tuple(replace(row, repeat=9) for row in own), np.ones((2, 8), np.float32), np.zeros((2, len(SIGNALS))))
+    episodes = [*dict.fromkeys(row.moment[:3] for row in table.rows), (instance, first, 9)]
+
+    def killed(*arguments, **settings):
+        raise KeyboardInterrupt
+
+    recording = MomentRecording(folder)
+    recording.add({(instance, first, 9): more})
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pyarrow.parquet, "write_table", killed)
+        recording.finish(episodes, cuts, about)
+    MomentRecording(folder).finish(episodes, cuts, about)
+    grown = read_moments(folder)
+    assert list(grown.rows) == [*table.rows, *more.rows]
+    np.testing.assert_array_equal(grown.seen.pictures, np.concatenate([table.seen.pictures, more.pictures]))
+    assert not (folder / MOMENT_SHARDS).exists()

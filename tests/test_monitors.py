@@ -87,6 +87,15 @@ def test_never_and_blind():
     assert begun("blind:6", TWO[:1]).drives_on(point(8)).policy == "small"
 
 
+def test_a_parameter_may_be_a_merge():
+    both = "merge:small+large"
+    for name in (f"blind:4:{both}", f"stall:{both}", f"disagreement:0.1:{both}"):
+        at = point(moved=0.0, change=0.0, differences={both: 0.2})
+        assert begun(name, (*TWO, Candidate(both, True))).drives_on(at).policy == both
+    with pytest.raises(UsageError, match="write blind:K or blind:K:TO"):
+        begun(f"blind:4:{both}:2")
+
+
 @pytest.mark.parametrize("duty", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("first", ["small", "large"])
 def test_random_keeps_its_duty(duty, first):

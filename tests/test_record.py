@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from remote_helpers import alive
-from run_helpers import HORIZON, children, command, environment, execute, make_world, next_commands, wait_for_lines, wait_until
+from run_helpers import HORIZON, children, command, environment, execute, next_commands, wait_for_lines, wait_until
 
 from osel_sim.analysis.log import read_log
 from osel_sim.api.report import report
@@ -26,15 +26,6 @@ from osel_sim.suites.registry import find_task
 
 INSTANCES, REPEATS = 5, 2
 SIZE = ("--instances", INSTANCES, "--repeats", REPEATS, "--start-seed", 40)
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])  # of servers that are started from here
-        yield folder
 
 
 @pytest.fixture(scope="module")

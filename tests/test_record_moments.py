@@ -8,25 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from run_helpers import command, environment, execute, make_world, wait_for_lines
+from run_helpers import command, environment, execute, wait_for_lines
 
+from osel_sim.api.record_moments import in_blocks
 from osel_sim.episodes.moment_recording import MOMENT_SHARDS
-from osel_sim.formats.journal import JOURNAL, read_lines, to_decision
+from osel_sim.episodes.workers import Plan
+from osel_sim.formats.journal import JOURNAL, TIMING, read_lines, to_decision
 from osel_sim.formats.moments import MOMENTS, SEEN, SIGNALS, read_moments
+from osel_sim.formats.points import POINTS
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.record import main as record_main
 from osel_sim.run import main as run_main
+from osel_sim.suites.registry import find_task
 
 SIZE = ("--instances", 2, "--action-noise", 0.05, "--moments", 1, "--most-moments", 2)
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])  # of servers that are started from here
-        yield folder
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +143,30 @@ def test_a_row_is_what_a_live_run_with_that_handover_comes_to(world, reference, 
     assert told is not None and [(one.call, one.step, one.to) for one in told.handoffs] == [(call, row.step, second)]
     assert told.by_policy[first].price == row.price_first
     assert told.duty_steps == row.remote_steps / row.steps
+
+
+def test_a_live_run_starts_warm_from_them_and_goes_on_so(world, reference, capsys):
+    out, flags = world / "warm", ["--selector", "random", "--monitor", "value", "--decide-every", 1, "--seed", 7, "--episodes", 2, "--no-page"]
+
+    def run(folder, *more):
+        arguments = command(world, "run", *flags, "--out", folder, *more)
+        assert run_main(list(map(str, arguments[3:]))) == 0
+        return capsys.readouterr().err
+
+    warm = ("--monitor-warm-start", reference)
+    assert "moments of 2 instances" in run(out, *warm)
+    run(world / "cold")
+    assert (out / POINTS).read_bytes() != (world / "cold" / POINTS).read_bytes()
+    whole = {name: (out / name).read_bytes() for name in (JOURNAL, POINTS)}
+    for name, content in whole.items():
+        (out / name).write_bytes(content.split(b"\n")[0] + b"\n")
+    (out / TIMING).write_bytes((out / TIMING).read_bytes().split(b"\n")[0] + b"\n")
+    run(out, *warm, "--resume")
+    assert {name: (out / name).read_bytes() for name in whole} == whole
+
+
+def test_an_interrupted_recording_has_some_of_every_task():
+    tasks = (find_task("lift"), find_task("stack"))
+    plan = Plan(tasks, (), (), range(3, 6), (0,), "test", "colours")
+    turns = [(plan.instances[key].task, plan.instances[key].seed) for key in in_blocks(plan.instances, plan)]
+    assert turns == [(task.name, seed) for seed in (3, 4, 5) for task in tasks]

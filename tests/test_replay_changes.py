@@ -16,6 +16,7 @@ from osel_sim.core.errors import SettingError, UnknownNameError, UsageError
 from osel_sim.formats.replay_result import read_replay
 from osel_sim.interface.selector import Choice
 from osel_sim.replay import main
+from osel_sim.reporting.changing_page import _arrived
 from osel_sim.selection.registry import make_selector
 from osel_sim.selection.reward import RewardWeights
 
@@ -223,6 +224,11 @@ def test_the_newcomers_share_is_counted_from_the_first_run_of_decisions_that_giv
     assert _until(share, 0.5) == 28  # 13 of the 25 that follow
     assert _until(np.zeros(10), 0.1) is None
     assert _until(np.ones(10), 0.5) == 0
+
+
+def test_a_share_that_is_there_at_once_is_not_told_as_one_that_never_comes():
+    newcomers = [{"policy": name, "decisions": {"through": after}} for name, after in (("soon", 0), ("late", None))]
+    assert _arrived(newcomers) == "soon 0, late never"
 
 
 def test_a_better_policy_is_taken_up_from_what_was_learned(tmp_path):

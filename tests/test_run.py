@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from remote_helpers import alive
-from run_helpers import HORIZON, children, command, environment, execute, make_world, next_commands, wait_for_lines, wait_until
+from run_helpers import HORIZON, children, command, environment, execute, next_commands, wait_for_lines, wait_until
 from synthetic_log import make_row, write_log
 
 from osel_sim.analysis.live import read_live
@@ -24,15 +24,6 @@ from osel_sim.run import main as run_main
 from osel_sim.selection.state import load_state
 
 EPISODES = 6
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        folder = make_world(tmp_path_factory.mktemp("world"))
-        patch.syspath_prepend(str(folder / "plugin"))
-        patch.setenv("PYTHONPATH", environment(folder)["PYTHONPATH"])  # of servers that are started from here
-        yield folder
 
 
 @pytest.fixture(scope="module")

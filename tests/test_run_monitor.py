@@ -5,7 +5,7 @@ import shutil
 import sys
 
 import pytest
-from run_helpers import execute, make_world
+from run_helpers import execute
 
 from osel_sim.analysis.live import read_live
 from osel_sim.formats.journal import JOURNAL, TIMING, read_journal
@@ -17,11 +17,6 @@ from osel_sim.selection.monitors.registry import MONITORS, make_monitor
 
 EPISODES = 4
 SETTINGS = ("--selector", "random", "--monitor", "value", "--decide-every", "1", "--episodes", EPISODES, "--counterfactual", "--no-page")
-
-
-@pytest.fixture(scope="module")
-def world(tmp_path_factory):
-    return make_world(tmp_path_factory.mktemp("world"))
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +57,8 @@ def test_what_it_saw_lies_beside_the_journal(run):
     assert log.outcomes.success.shape[:2] == (EPISODES, 2)
     others = [json.loads(line) for line in (folder / "counterfactual.jsonl").read_text().splitlines()]
     assert all(set(line) == {"index", "policies", "alone"} and "monitored" not in line["alone"] for line in others)
+    timed = [set(json.loads(line)["episodes"]) for line in (folder / TIMING).read_text().splitlines()]
+    assert timed == [{"calm", "wild", f"{decision.policy} alone"} for decision in decisions]
 
 
 @pytest.mark.slow
@@ -77,6 +74,12 @@ def test_a_run_that_was_cut_off_goes_on_to_the_same_bytes(run, world):
     assert done.returncode == 0, done.stderr
     for name in (JOURNAL, POINTS, "counterfactual.jsonl", "summary.json"):
         assert (cut / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_its_policies_do_not_come_and_go(run, world):
+    done = execute(world, "run", "--out", "run", *SETTINGS, "--video", 1, "--resume", "--retire", "wild")
+    assert done.returncode == 2 and "do not come and go" in done.stderr
 
 
 @pytest.mark.parametrize(

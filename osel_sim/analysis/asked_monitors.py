@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.cross_fit import Rows
+from osel_sim.analysis.handovers import driving_on
 from osel_sim.analysis.moment_log import MomentLog
 from osel_sim.formats.moments import SIGNALS
 from osel_sim.interface.monitor import Candidate, DecisionPoint, Monitor, Told, Turn, Watched
@@ -34,7 +35,7 @@ def asked_turns(log: MomentLog, weights: RewardWeights, name: str, by: Rows, on:
         UnknownNameError, UsageError: no such monitor, or it does not take these parameters.
         DataError: it looks at what the table does not have.
     """
-    turns = np.broadcast_to(np.arange(len(log.policies))[None, :, None, None], log.there.shape).copy()
+    turns = driving_on(log)
     fold = np.random.default_rng(0).permutation(int(by.sum())) % FOLDS
     for number in range(FOLDS):
         inside, outside = by.copy(), by.copy()

@@ -62,7 +62,9 @@ class BudgetPlan:
         }
 
 
-def plan_budgets(log: LoggedOutcomes, setup: Setup, selectors: Sequence[str], budget: tuple[float, int], seeds: int) -> BudgetPlan:
+def plan_budgets(
+    log: LoggedOutcomes, setup: Setup, selectors: Sequence[str], budget: tuple[float, int], seeds: int, decisions: int | None = None
+) -> BudgetPlan:
     """Plan a curve around a budget.
 
     Args:
@@ -71,6 +73,7 @@ def plan_budgets(log: LoggedOutcomes, setup: Setup, selectors: Sequence[str], bu
         selectors: to replay.
         budget: cents, and for how many decisions.
         seeds: wanted.
+        decisions: length of a stream; None: all instances.
 
     Raises:
         DataError: the log lacks prices.
@@ -90,7 +93,7 @@ def plan_budgets(log: LoggedOutcomes, setup: Setup, selectors: Sequence[str], bu
         except BudgetError:  # too little for any decision: the curve begins above it
             continue
     setups = [replace(setup, budget=own) for own in found]
-    return BudgetPlan(Part(log, setups, list(selectors), range(min(seeds, SEEDS))), tuple(found), cents, setup.weights)
+    return BudgetPlan(Part(log, setups, list(selectors), range(min(seeds, SEEDS)), decisions), tuple(found), cents, setup.weights)
 
 
 def best_within(rewards: Array, prices: Array, pace: float, free: bool) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from osel_sim.analysis.handovers import Handovers, blind, by_chance, driven_steps, never, outcomes
+from osel_sim.analysis.handovers import Handovers, blind, by_chance, never, outcomes, with_starts
 from osel_sim.analysis.log import Array
 from osel_sim.analysis.moment_log import MomentLog
 
@@ -36,7 +36,7 @@ def blind_arms(log: MomentLog, wanted: float, share: Array) -> list[Arm]:
 
     Args:
         wanted: the duty.
-        share: weight of each episode, broadcast to (N, P, R): how likely the start selector is to choose that first policy.
+        share: (N, P), how likely the start selector is to choose each first policy.
 
     Returns:
         one arm a target that can come to that duty at all.
@@ -77,7 +77,7 @@ def random_arm(log: MomentLog, wanted: float, share: Array) -> Arm | None:
 
 @dataclass(frozen=True)
 class _Driven:
-    """Control steps of all episodes together, and those of them that remote policies drive."""
+    """Control steps of all instances together, each the mean over its repeats, and those of them that remote policies drive."""
 
     steps: float
     remote: float
@@ -89,7 +89,7 @@ class _Driven:
 
 def _driven(log: MomentLog, handovers: Handovers, share: Array) -> _Driven:
     found = outcomes(log, handovers, ("steps", "remote_steps"))
-    return _Driven(*driven_steps(found, share))
+    return _Driven(*(float(np.nansum(with_starts(found[name], share))) for name in ("steps", "remote_steps")))
 
 
 def _weight(low: _Driven, high: _Driven, wanted: float) -> float:

@@ -7,13 +7,13 @@ leaves nothing to chance, a random one and a mixture of both are measured alike,
 Episodes with one handoff at most are all that the table has. What a monitor would do after that is not known, and it is not asked.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from osel_sim.analysis.log import Array
+from osel_sim.analysis.log import Array, mean_over_repeats
 from osel_sim.analysis.moment_log import KEPT, MomentLog, rewards_of
 from osel_sim.selection.reward import RewardWeights
 
@@ -65,8 +65,7 @@ def first_turns(log: MomentLog, turns: NDArray[np.int64]) -> Handovers:
         turns: (N, P, R, M), column of the policy that is to drive on; the driver's own, or anything where there is no point, hands over to nobody.
     """
     result = never(log)
-    driver = np.arange(len(log.policies))[None, :, None, None]
-    passes = log.there & (turns != driver)
+    passes = log.there & (turns != driving_on(log))
     first = passes & (np.cumsum(passes, axis=3) == 1)
     where = np.nonzero(first)
     result[(*where, turns[where])] = 1.0
@@ -93,16 +92,19 @@ def recovered_and_harmed(log: MomentLog, handovers: Handovers) -> tuple[Array, A
     return lost, lost * then, won, won * (1.0 - then)
 
 
-def driven_steps(measures: Mapping[str, Array], share: Array) -> tuple[float, float]:
-    """Control steps of all episodes together, and those of them that remote policies drive: the second over the first is the duty.
+def with_starts(values: Array, share: Array) -> Array:
+    """What each instance comes to, (N,), over its repeats and first policies; NaN where something that may happen has no outcome.
 
     Args:
-        measures: as `outcomes` gives them.
-        share: weight of each episode, broadcast to (N, P, R).
+        values: (N, P, R), of each episode.
+        share: (N, P), how likely each first policy is chosen.
     """
-    known = np.isfinite(measures["steps"]) & np.isfinite(measures["remote_steps"])
-    weight = np.where(known, np.broadcast_to(share, known.shape), 0.0)
-    return float((weight * np.nan_to_num(measures["steps"])).sum()), float((weight * np.nan_to_num(measures["remote_steps"])).sum())
+    return np.asarray(np.where(share > 0.0, share * mean_over_repeats(values), 0.0).sum(axis=1), np.float64)
+
+
+def driving_on(log: MomentLog) -> NDArray[np.int64]:
+    """Turns in which nobody hands over, as `first_turns` takes them: the driver at each decision point, (N, P, R, M)."""
+    return np.broadcast_to(np.arange(len(log.policies))[None, :, None, None], log.there.shape).copy()
 
 
 def _expected(alone: Array, ways: Array, stays: Array, handovers: Handovers) -> Array:

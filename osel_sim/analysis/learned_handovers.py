@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from osel_sim.analysis.cross_fit import Rows
-from osel_sim.analysis.handovers import first_turns, reward_of
+from osel_sim.analysis.handovers import driving_on, first_turns, reward_of
 from osel_sim.analysis.log import Array, mean_over_repeats
 from osel_sim.analysis.moment_log import MomentLog, rewards_of
 from osel_sim.selection.reward import RewardWeights
@@ -83,13 +83,12 @@ def learned_turns(
         look, signals: what it may look at.
 
     Returns:
-        turns: (N, P, R, M), as `osel_sim.analysis.handovers.first_turns` takes them: of the instances `on`, and of those `by` what was said of each
-        fold
-            by the others. The rest drives on.
+        turns: (N, P, R, M), as `osel_sim.analysis.handovers.first_turns` takes them: of the instances `on`, and of those `by` what was said of
+            each fold by the others. The rest drives on.
         chosen: first policy -> what was decided.
     """
     features, gains = features_of(log, by, look, signals), gains_of(log, weights)
-    turns = _driving_on(log)
+    turns = driving_on(log)
     chosen = {}
     for first, name in enumerate(log.policies):
         found, inside = _choose(log, weights, gains, features, by, first)
@@ -99,11 +98,6 @@ def learned_turns(
             turns[on, first] = _turns(predicted, first, found.promise)
             turns[by, first] = inside[by]
     return turns, chosen
-
-
-def _driving_on(log: MomentLog) -> NDArray[np.int64]:
-    """The driver at each decision point, (N, P, R, M)."""
-    return np.broadcast_to(np.arange(len(log.policies))[None, :, None, None], log.there.shape).copy()
 
 
 def gains_of(log: MomentLog, weights: RewardWeights) -> Array:
@@ -117,7 +111,7 @@ def _choose(log: MomentLog, weights: RewardWeights, gains: Array, features: Arra
     """Regression and promise of one first policy, by what they come to on folds that were not learned from; and what they say there, (N, R, M)."""
     rows = np.flatnonzero(by)
     fold = np.random.default_rng(0).permutation(len(rows)) % FOLDS
-    best, said = Chosen("", 0.0, 0.0, 0.0), _driving_on(log)[:, first]
+    best, said = Chosen("", 0.0, 0.0, 0.0), driving_on(log)[:, first]
     if log.there[rows, first].sum() < FEWEST:
         return best, said
     alone = mean_over_repeats(rewards_of(log.alone, weights))[rows, first]
@@ -128,7 +122,7 @@ def _choose(log: MomentLog, weights: RewardWeights, gains: Array, features: Arra
             inside[rows[fold != number]], outside[rows[fold == number]] = True, True
             predicted[outside] = _predict(log, make, gains, features, inside, outside, first)
         for promise in PROMISES:
-            turns = _driving_on(log)
+            turns = driving_on(log)
             turns[:, first] = _turns(predicted, first, promise)
             then = mean_over_repeats(reward_of(log, first_turns(log, turns), weights))[rows, first]
             apart = (then - alone)[np.isfinite(then - alone)]

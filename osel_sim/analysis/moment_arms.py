@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.engine import Part as Stream
 from osel_sim.analysis.engine import Setup, replay_parts
-from osel_sim.analysis.handovers import Handovers, outcomes, recovered_and_harmed, reward_of
-from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
-from osel_sim.analysis.moment_log import KEPT, MomentLog
+from osel_sim.analysis.handovers import Handovers, outcomes, recovered_and_harmed, reward_of, with_starts
+from osel_sim.analysis.log import Array, LoggedOutcomes
+from osel_sim.analysis.moment_log import MomentLog
 from osel_sim.analysis.told import told
 from osel_sim.analysis.warm_start import WarmStart
 from osel_sim.interface.selector import SelectorFactory
@@ -55,14 +55,9 @@ class Values:
 
 def values_of(log: MomentLog, share: Array, handovers: Handovers, weights: RewardWeights) -> Values:
     """What instances come to if first policies are chosen with these probabilities (N, P), and handed over so."""
-
-    def mean(values: Array) -> Array:
-        own = mean_over_repeats(values)
-        return np.asarray(np.where(share > 0.0, share * own, 0.0).sum(axis=1), np.float64)
-
-    parts = [mean(part) for part in recovered_and_harmed(log, handovers)]
-    measures = {name: mean(values) for name, values in outcomes(log, handovers).items()}
-    return Values(share, mean(reward_of(log, handovers, weights)), {name: measures[name] for name in KEPT}, *parts)
+    parts = [with_starts(part, share) for part in recovered_and_harmed(log, handovers)]
+    measures = {name: with_starts(values, share) for name, values in outcomes(log, handovers).items()}
+    return Values(share, with_starts(reward_of(log, handovers, weights), share), measures, *parts)
 
 
 def as_episodes(log: MomentLog, handovers: Handovers) -> LoggedOutcomes:

@@ -58,14 +58,15 @@ def study(log: MomentLog, weights: RewardWeights, monitors: Mapping[str, Handove
         for start, share in starts.items():
             values[start, name] = found = _scored(values_of(log, share, handovers, weights), scored)
             arms.append({"start": start, "monitor": name, **_measured(found, units)})
+    here = log.take(scored)
     for arm in arms:
         own, alone = values[arm["start"], arm["monitor"]], values[arm["start"], NEVER]
         if arm["monitor"] != NEVER:
             arm |= _against(own, alone, units)
             if not arm["monitor"].startswith(BLIND):
-                arm["equal_duty"] = _equal_duty(log.take(scored), arm, own, weights)
+                arm["equal_duty"] = _equal_duty(here, arm, own, weights, units)
     _correct(arms)
-    found_oracles = oracles_of(log.take(scored), weights)
+    found_oracles = oracles_of(here, weights)
     result = {
         "policies": list(log.policies),
         "remote": [name for name, remote in zip(log.policies, log.remote, strict=True) if remote],
@@ -77,11 +78,11 @@ def study(log: MomentLog, weights: RewardWeights, monitors: Mapping[str, Handove
         "margin": question.margin,
         "arms": arms,
         "oracles": _oracles(log, found_oracles, arms, values),
-        "gains": [asdict(gain) for gain in gains_at(log.take(scored), weights, units)],
+        "gains": [asdict(gain) for gain in gains_at(here, weights, units)],
     }
     result["verdict"] = said = verdict(result)
     shown = said["monitor"] or NEVER
-    result["timeline"] = timeline(log.take(scored), values[said["start"], shown].share, monitors[shown][scored])
+    result["timeline"] = timeline(here, values[said["start"], shown].share, monitors[shown][scored])
     return result
 
 
@@ -132,12 +133,11 @@ def _correct(arms: Sequence[dict[str, Any]]) -> None:
                 arm[f"{name}_holm"] = corrected
 
 
-def _equal_duty(here: MomentLog, arm: Mapping[str, Any], own: Values, weights: RewardWeights) -> list[dict[str, Any]]:
+def _equal_duty(here: MomentLog, arm: Mapping[str, Any], own: Values, weights: RewardWeights, units: NDArray[np.int64]) -> list[dict[str, Any]]:
     """Blind and random handovers from the same starts at the monitor's duty, on the scored instances."""
-    share, units = own.share[:, :, None], units_of(here.whole)
-    chance = random_arm(here, arm["duty"], share)
+    chance = random_arm(here, arm["duty"], own.share)
     result = []
-    for other in [*blind_arms(here, arm["duty"], share), *([] if chance is None else [chance])]:
+    for other in [*blind_arms(here, arm["duty"], own.share), *([] if chance is None else [chance])]:
         values = values_of(here, own.share, other.handovers, weights)
         result.append({"name": other.name, **_measured(values, units), "ahead": _json(mean_of(own.reward - values.reward, units))})
     return result

@@ -3,7 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-FIXED = "fixed:"
+from osel_sim.analysis.moment_arms import FIXED
+
 FEWEST = 10
 """Instances with repeats that a sentence about the oracles needs."""
 ERROR = 0.05

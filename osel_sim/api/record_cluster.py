@@ -35,6 +35,7 @@ JOBS = "jobs"
 """Beside it: what the engine keeps of its jobs, such as their output."""
 SCHEMA_VERSION = 1
 POLL_SECONDS = 0.5
+"""Between two looks at the jobs: submitit itself only looks for the files of their results, and nobody tells of jobs of an earlier session."""
 _ITS_OWN = {"out", "resume", "workers", "trust", "cluster", "retries", "at_once", "cluster_option"}
 """Settings that may be others when it goes on."""
 _OF_THE_WHOLE = {"out", "resume", "cluster", "shards", "retries", "at_once", "cluster_option"}
@@ -51,7 +52,7 @@ def is_for_cluster(config: RecordConfig) -> bool:
     """
     if config.cluster is not None:
         return True
-    going_on = config.resume and config.out is not None and (config.out / PARTS / SETTINGS).exists() and not (config.out / RUN).exists()
+    going_on = config.resume and config.out is not None and (config.out / PARTS / SETTINGS).exists() and not (config.out / ROLLOUTS).exists()
     for name in ("shards", "retries", "at_once", "cluster_option"):
         if not going_on and getattr(config, name) != getattr(RecordConfig, name):
             raise SettingError(name, "is for a recording on a cluster; add --cluster slurm, ray or local, or leave it out")

@@ -14,13 +14,17 @@ from osel_sim.api.reward import weights_of
 from osel_sim.core.errors import DataError, SettingError, UnknownNameError, UsageError
 
 if TYPE_CHECKING:
+    from osel_sim.analysis.budgets import BudgetPlan
     from osel_sim.analysis.encoder_choice import EncoderChoice
     from osel_sim.analysis.engine import Setup
     from osel_sim.analysis.frontier import FrontierPlan
     from osel_sim.analysis.live import LiveLog
     from osel_sim.analysis.log import LoggedOutcomes
+    from osel_sim.analysis.oracles import Oracles
     from osel_sim.analysis.sharing import Robots
+    from osel_sim.analysis.streams import LeftOut
     from osel_sim.analysis.targets import Target
+    from osel_sim.formats.replay_result import Choices
     from osel_sim.interface.selector import SelectorFactory
     from osel_sim.selection.reward import RewardWeights
 
@@ -78,6 +82,38 @@ def replay(
 
 
 @dataclass(frozen=True)
+class _Material:
+    """What is replayed, and what is known of it beforehand.
+
+    Attributes:
+        log: complete instances only.
+        setup: what selectors are told and shown.
+        left_out: instances that are not complete.
+        preset: name of the reward's weights, if they have one.
+        choice: how the encoder was chosen, where it was.
+        off_policy: estimates from a live run's propensities.
+    """
+
+    log: "LoggedOutcomes"
+    setup: "Setup"
+    selectors: Sequence[str]
+    left_out: "LeftOut"
+    preset: str | None
+    choice: "EncoderChoice | None"
+    off_policy: dict[str, Any] | None
+
+    def result(self, config: ReplayConfig, choices: "Choices", best: "Oracles") -> dict[str, Any]:
+        """What `replay.json` has of these choices."""
+        from osel_sim.analysis.result import Question, build
+
+        question = Question(config.margin, config.half is not None, config.route_with)
+        result = build(self.log, self.setup.weights, self.preset, choices, best, self.left_out, range(config.seeds), question)
+        result["log"] |= {"half": config.half, "context": config.context}
+        result["log"]["encoder_choice"] = None if self.choice is None else {"text": str(self.choice), **asdict(self.choice)}
+        return result | {"off_policy": self.off_policy} | _told(self.setup)
+
+
+@dataclass(frozen=True)
 class _Replay:
     """One call of `replay`."""
 
@@ -104,6 +140,7 @@ class _Replay:
                 raise UnknownNameError("selector", name, set(selectors) - {"random"}, "--route-with names selectors that are replayed")
         check_replay_folder(folder, config.overwrite)
         self._robots(selectors)  # refuses what cannot be, before anything is read
+        check_budget(config, True)
         if not is_live_run(config.log):
             log = read_log(config.log, None if config.encoder == AUTO else config.encoder)
             weights, preset = weights_of(config, log.metadata)
@@ -118,10 +155,10 @@ class _Replay:
         else:
             live = read_live(config.log, config.encoder)
             weights, preset = weights_of(config, recorded=live.reward)
-        found = self._off_policy(live, weights)
-        check_all_outcomes(config, live.has_all_outcomes(weights))
-        check_budget(config, live.has_all_outcomes(weights))
-        if live.has_all_outcomes(weights):
+        found, whole = self._off_policy(live, weights), live.has_all_outcomes(weights)
+        check_all_outcomes(config, whole)
+        check_budget(config, whole)
+        if whole:
             return self._replay(selectors, live.outcomes, weights, preset, off_policy=found)
         if config.robots > 1:
             raise UsageError(f"--robots {config.robots} needs the outcomes of every policy, and {config.log} has only those of what was chosen")
@@ -137,30 +174,35 @@ class _Replay:
         choice: "EncoderChoice | None" = None,
         off_policy: dict[str, Any] | None = None,
     ) -> ReplayResult:
-        """Replay stage by stage: what a verdict needs, all other selectors, and again at other weights. Each is written and told."""
-        from osel_sim.analysis.engine import Part, replay_parts
-        from osel_sim.analysis.oracles import oracles
-        from osel_sim.analysis.result import Question, build, tables, with_fixed
-        from osel_sim.api.replay_budgets import check_budget, plan_budgets_of
+        """Prepare what is replayed, and replay it."""
+        from osel_sim.api.replay_budgets import plan_budgets_of
         from osel_sim.api.replay_changes import changes_asked, replay_changes
-        from osel_sim.api.robots import replay_robots
-        from osel_sim.core.progress import progress
-        from osel_sim.formats.replay_result import BUDGET, FRONTIER, PENDING, SHARING, write_replay
 
-        config, seeds, robots = self.config, range(self.config.seeds), self._robots(selectors)
-        check_budget(config, True)
+        config = self.config
         if config.context:
             log = log.with_tasks()
         log, others, left_out = self._instances(log, weights)
         setup = self._setups(log, others, selectors)
+        here = setup(weights)
         if changes_asked(config):
-            return replay_changes(
-                *(config, log, setup(weights), selectors, left_out, preset, self.factories), lambda done: self._tell(done, config.folder, True)
-            )
-        here, question = setup(weights), Question(config.margin, config.half is not None, config.route_with)
+            shared = config, log, here, selectors, left_out, preset, self.factories
+            return replay_changes(*shared, lambda done: self._tell(done, config.folder, True))
         plan = None if config.no_frontier else self._plan_frontier(log, setup, weights, selectors)
-        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors, len(seeds) * (config.decisions or len(log)))]
         budgets = plan_budgets_of(config, log, here, selectors)
+        return self._by_stages(_Material(log, here, selectors, left_out, preset, choice, off_policy), budgets, plan)
+
+    def _by_stages(self, material: "_Material", budgets: "BudgetPlan | None", plan: "FrontierPlan | None") -> ReplayResult:
+        """Replay what a verdict needs, all other selectors, within budgets, at other weights, and to robots. Each is written and told."""
+        from osel_sim.analysis.engine import Part, replay_parts
+        from osel_sim.analysis.oracles import oracles
+        from osel_sim.analysis.result import tables, with_fixed
+        from osel_sim.api.robots import replay_robots
+        from osel_sim.core.progress import progress
+        from osel_sim.formats.replay_result import BUDGET, FRONTIER, PENDING, SHARING, write_replay
+
+        config, log, here, selectors, off_policy = self.config, material.log, material.setup, material.selectors, material.off_policy
+        seeds, robots = range(config.seeds), self._robots(selectors)
+        stages = [Part(log, [here], names, seeds, config.decisions) for names in _stages(selectors, len(seeds) * (config.decisions or len(log)))]
         parts = [*stages, *([] if budgets is None else [budgets.part]), *([] if plan is None else [plan.part])]
         done, chosen, result = ReplayResult(config.folder), dict[str, Any](), dict[str, Any]()
         with (
@@ -168,12 +210,12 @@ class _Replay:
             closing(replay_parts(parts, config.workers, bar.update, self.factories)) as replayed,
             ThreadPoolExecutor(1) as beside,
         ):
-            bounds = beside.submit(oracles, log, weights)  # while workers begin
+            bounds = beside.submit(oracles, log, here.weights)  # while workers begin
             if config.workers == 1:
                 bounds.result()  # what is replayed in this process limits its threads, on which last bits depend
             for part, made in zip(parts, replayed, strict=True):
                 if plan is not None and part is plan.part:
-                    result["frontier"] = plan.frontiers(made)
+                    result[FRONTIER] = plan.frontiers(made)
                 elif budgets is not None and part is budgets.part:
                     result[BUDGET] = budgets.measured(made)
                 else:
@@ -181,11 +223,7 @@ class _Replay:
                     known = {name: chosen[name] for name in selectors if name in chosen}
                     best = bounds.result()
                     choices = with_fixed(replace(made[0], chosen=known), best)
-                    result = build(log, weights, preset, choices, best, left_out, seeds, question)
-                    result["log"] |= {"half": config.half, "context": config.context}
-                    result["log"]["encoder_choice"] = None if choice is None else {"text": str(choice), **asdict(choice)}
-                    result["off_policy"] = off_policy
-                    result |= _told(here)
+                    result = material.result(config, choices, best)
                 pending = [name for name in selectors if name not in chosen]
                 pending += [BUDGET] if budgets is not None and BUDGET not in result else []
                 pending += [FRONTIER] if plan is not None and part is not plan.part else []

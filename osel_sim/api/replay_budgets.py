@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from osel_sim.api.replay_changes import changes_asked
 from osel_sim.core.errors import BudgetError, SettingError
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ def check_budget(config: "ReplayConfig", known: bool) -> None:
         if config.budget_per is not None:
             raise SettingError("budget_per", "is the number of decisions that --budget-cents is for: give that, too")
         return
-    if config.join or config.leave or config.drift:
+    if changes_asked(config):
         raise SettingError("budget_cents", "is for streams that do not change: leave --join, --leave and --drift out")
     if not known:
         raise SettingError("budget_cents", f"needs the outcomes of every policy: {config.log} has those of what was chosen only")
@@ -43,14 +44,11 @@ def plan_budgets_of(config: "ReplayConfig", log: "LoggedOutcomes", setup: "Setup
     """
     if config.budget_cents is None:
         return None
-    from dataclasses import replace
-
     from osel_sim.analysis.budgets import plan_budgets
 
     names = selectors if config.selectors else [name for name in selectors if name in WITHIN]
-    decisions = config.decisions or len(log)
+    budget = config.budget_cents, config.budget_per or config.decisions or len(log)
     try:
-        plan = plan_budgets(log, setup, names, (config.budget_cents, config.budget_per or decisions), config.seeds)
+        return plan_budgets(log, setup, names, budget, config.seeds, config.decisions)
     except BudgetError as error:
         raise SettingError("budget_cents", str(error)) from None
-    return replace(plan, part=replace(plan.part, decisions=config.decisions))

@@ -55,6 +55,7 @@ def replay_changes(
     """
     from osel_sim.analysis.changing_replay import ChangingLog, replay_changing, total_decisions
     from osel_sim.analysis.changing_result import build_changes
+    from osel_sim.analysis.result import tables
     from osel_sim.analysis.stream_changes import timeline
     from osel_sim.api.results import ReplayResult
     from osel_sim.core.progress import progress
@@ -67,11 +68,11 @@ def replay_changes(
         chosen = replay_changing(material, selectors, config.workers, bar.update, factories)
     about = {"half": config.half, "context": config.context}
     result, choices = build_changes(material, {name: chosen[name] for name in selectors}, left_out, preset, about)
-    write_replay(config.folder, result, choices, {"selectors": _rows(result), "changes": change_rows(result)})
+    write_replay(config.folder, result, choices, {"selectors": tables(result)["selectors"], "changes": _change_rows(result)})
     return tell(ReplayResult(config.folder, result))
 
 
-def change_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _change_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
     """A row a selector and change: what it received soon after it, and against the others."""
     rows = []
     for name, entry in result["changes"]["selectors"].items():
@@ -85,9 +86,3 @@ def change_rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
                     row |= {key: own[key]["mean"], f"{key}_low": low, f"{key}_high": high, f"{key}_sum": own[key]["sum"]}
                 rows.append(row)
     return rows
-
-
-def _rows(result: Mapping[str, Any]) -> list[dict[str, Any]]:
-    from osel_sim.analysis.result import tables
-
-    return tables(result)["selectors"]

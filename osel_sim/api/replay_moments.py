@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from osel_sim.api.results import MomentsResult
 from osel_sim.api.reward import weights_of
-from osel_sim.core.errors import SettingError, UsageError
+from osel_sim.core.errors import DataError, SettingError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.handovers import Handovers
@@ -47,15 +47,16 @@ def replay_moments(
 
     Raises:
         SettingError: a setting that goes with other replays only.
-        DataError: the table or the rollout log beside it is damaged.
+        UsageError: there is but one policy, or one half has no instances.
+        DataError: the table or the rollout log beside it is damaged, or lacks outcomes of a policy.
     """
     from osel_sim.analysis.moment_arms import Starts
     from osel_sim.analysis.moment_log import read_moment_log
     from osel_sim.analysis.moment_result import Question, study
     from osel_sim.analysis.moment_tables import tables
     from osel_sim.api.replay_settings import choose_selectors
-    from osel_sim.formats.moments_result import write_moments_result
-    from osel_sim.formats.replay_result import check_replay_folder
+    from osel_sim.formats.moments_result import MOMENTS_RESULT, write_moments_result
+    from osel_sim.formats.replay_result import check_replay_folder, drop_others
 
     for name in _NOT_HERE:
         if name in config.given:
@@ -70,6 +71,7 @@ def replay_moments(
         log = log.only(tuple(config.policies))
     weights, preset = weights_of(config, log.whole.metadata)
     part = _part(log, config.half or "score")
+    _check_policies(log, weights, part)
     monitors, about = _monitors(log, weights, part, config.monitors or MONITORS)
     starts = Starts(selectors, range(config.seeds), config.workers, own)
     result = study(log, weights, monitors, Question(starts, part, config.margin))
@@ -77,6 +79,7 @@ def replay_moments(
     result["log"] = {"folder": str(config.log), "encoder": log.whole.encoder, "half": config.half or "score", "preset": preset}
     result["log"] |= {"every": metadata["every"], "most": metadata["most"], "moments": int(log.there.sum()), "about": about}
     write_moments_result(config.folder, result, tables(result))
+    drop_others(config.folder, MOMENTS_RESULT)
     if config.open:
         from osel_sim.api.report import report
 
@@ -93,6 +96,21 @@ def _part(log: "MomentLog", half: Any) -> "Part":
             f"all {len(log)} instances of {log.whole.source} are of one half: monitors are learned on one half and scored on the other; record more"
         )
     return Part(scored, ~scored)
+
+
+def _check_policies(log: "MomentLog", weights: "RewardWeights", part: "Part") -> None:
+    """Refuse a table with nobody to hand over to, or with a policy of which one half says nothing."""
+    import numpy as np
+
+    if len(log.policies) < 2:
+        raise UsageError(f"{log.whole.source}: with {log.policies[0]} alone there is nobody to hand over to; name two policies or more")
+    rewards = log.whole.rewards(weights)
+    for rows in (part.scored, part.shown):
+        for column, policy in enumerate(log.policies):
+            if np.isnan(rewards[rows, column]).all():
+                raise DataError(
+                    f"{log.whole.source}: {policy} has no outcome on any of the {rows.sum()} instances of one half; name others by --policies"
+                )
 
 
 def _monitors(log: "MomentLog", weights: "RewardWeights", part: "Part", names: Sequence[str]) -> "tuple[dict[str, Handovers], dict[str, Any]]":

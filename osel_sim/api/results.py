@@ -113,7 +113,7 @@ class ReplayResult:
 
     @property
     def pending(self) -> list[str]:
-        """What is not replayed yet: names of selectors, and `frontier`."""
+        """What is not replayed yet: names of selectors, `budget`, `frontier` and `sharing`."""
         return list(self.result.get("pending", [])) if self.result else []
 
     @property

@@ -128,7 +128,7 @@ class _Run:
         self._check_selector()
         self.budget = budget_of(config, self.tasks, [*self.policies, *self.plan.joined.values()])
         self.sharing = check_robots(config, self.tasks, named=self.factory is None)
-        check_monitor(config, monitor, self.policies, changing=bool(self.plan.changes))
+        check_monitor(config, monitor, self.policies)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)

@@ -18,19 +18,14 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-def check_monitor(config: RunConfig, factory: "MonitorFactory | None", policies: "Sequence[PolicySpec]", changing: bool) -> None:
+def check_monitor(config: RunConfig, factory: "MonitorFactory | None", policies: "Sequence[PolicySpec]") -> None:
     """Refuse settings of a monitor that cannot be, before anything heavy is loaded.
-
-    Args:
-        changing: policies join or leave the run.
 
     Raises:
         UnknownNameError: no such monitor, or its parameter names none of the policies.
         UsageError: a parameter is wrong, or a setting of a monitor is given without one.
     """
     if config.monitor is not None:
-        if changing:
-            raise UsageError("--monitor decides between the policies that the run began with: none may join or leave a run that has one")
         monitor = _make(config, factory, policies, 1)
         if config.monitor_warm_start is not None:
             from osel_sim.analysis.moment_warm_start import check_can_start_warm

@@ -47,15 +47,13 @@ def held(folder: Path) -> Iterator[None]:
 
 def is_held(folder: Path) -> bool:
     """Whether another process holds a folder now."""
-    if not (folder / LOCK).exists():
-        return False
     try:
-        with (folder / LOCK).open("a", encoding="utf-8") as handle:
+        with (folder / LOCK).open("r+", encoding="utf-8") as handle:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     except OSError:
-        pass  # no lock to be had here, or it has gone meanwhile
+        pass  # there is none, or none to be had here
     return False
 
 

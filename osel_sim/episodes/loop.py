@@ -200,9 +200,10 @@ class Episode:
         self.begin(driver, episode_seed(self.instance.key, driver.spec.name, self.repeat))
         return (yield from self.drive_on(driver, decide))
 
-    def drive_on(self, driver: Driver, decide: bool, answer: Answer | None = None) -> Course[str | None]:
-        """The same, of one that has taken over already; `answer` is its first, where it has been asked."""
+    def drive_on(self, driver: Driver, decide: bool) -> Course[str | None]:
+        """The same, of one that has taken over already."""
         while not self.env.done:
+            answer: Answer | None = None
             if decide and self.watch is not None and self.watch.due:
                 turn = yield self.watch.point(self)
                 driver, answer = self.watch.take(self, driver, turn)
@@ -213,7 +214,7 @@ class Episode:
                 if self.watch is not None:
                     self.watch.called(difference(self.rest, call.actions, self.spec.action) if self.planner == len(self.tallies) - 1 else None)
                 answer = call, self.answered(call, driver, self.tallies[-1])
-            (call, made), answer = answer, None
+            call, made = answer
             if call.actions is None:
                 return call.failure
             self.tallies[-1].paid_per_action = call.paid_per_action  # only now: what was made while waiting is of the answer before

@@ -82,8 +82,8 @@ def read_part(folder: Path) -> Part:
     return part
 
 
-def merge(folders: Sequence[Path], out: Path) -> list[Row]:
-    """Put shards together in a folder that this process holds, and return all rows.
+def merge(folders: Sequence[Path], out: Path) -> None:
+    """Put shards together in a folder that this process holds.
 
     Raises:
         DataError: a shard is not finished, missing, there twice, or of another recording; says which.
@@ -107,7 +107,6 @@ def merge(folders: Sequence[Path], out: Path) -> list[Row]:
     write_json(out / RUN, head | {"configuration": first.configuration, "environment": first.run["environment"]})
     contexts.save()
     write_rollouts(out, rows, {key: value for key, value in first.metadata.items() if key not in ("shard", "schema_version")})
-    return rows
 
 
 def _has_all(part: Part) -> bool:

@@ -1,15 +1,13 @@
 """Going on from a decision point with another policy: what would have come of handing over there."""
 
-from collections.abc import Sequence
-
 from osel_sim.core.errors import UsageError
 from osel_sim.episodes.handoffs import decided
-from osel_sim.episodes.loop import Moment, Subscriber
+from osel_sim.episodes.loop import Moment
 from osel_sim.interface.monitor import Turn
 from osel_sim.interface.outcome import Outcome
 
 
-def go_on(moment: Moment, policy: str, why: str = "", subscribers: Sequence[Subscriber] = ()) -> Outcome:
+def go_on(moment: Moment, policy: str) -> Outcome:
     """Go back to a decision point and let another policy drive from there to the end; no more decision points follow.
 
     Steps, time, price and chance are those of the episode so far, so this is to the bit what would have come of it had a monitor said so there.
@@ -17,7 +15,6 @@ def go_on(moment: Moment, policy: str, why: str = "", subscribers: Sequence[Subs
     Args:
         moment: kept there by `osel_sim.episodes.handoffs.Handoffs.cut`. It stays as it is, to go on from again.
         policy: one of the policies of the episode's `Handoffs`, other than the driver.
-        why: of the handoff.
 
     Returns:
         the outcome of the whole episode, from its beginning.
@@ -29,9 +26,9 @@ def go_on(moment: Moment, policy: str, why: str = "", subscribers: Sequence[Subs
     watch = episode.watch
     if watch is None or policy == moment.point.driver:
         raise UsageError(f"an episode goes on from a decision point with another policy than {policy!r}, which drives there already")
-    turn = Turn(policy, why)
+    turn = Turn(policy)
     turn.check(watch.handoffs.policies)
-    episode.show_to(subscribers)
+    episode.show_to(())
     episode.env.restore(moment.snapshot)
     driver, _ = watch.hand_over(episode, turn)
     return decided(episode.course(episode.drive_on(driver, decide=False), None), None)

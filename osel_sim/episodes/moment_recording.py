@@ -52,6 +52,10 @@ class MomentRecording:
             episodes: of the plan, in order; those without moments may be among them.
             metadata: of the table, besides how episodes were cut.
         """
+        if (self._folder / MOMENTS).exists():
+            # The table's two files change one after the other. Until both have, the shards hold what the old ones held.
+            self.add(dict(self._there))
+            (self._folder / MOMENTS).unlink()
         found = [self._there[episode] for episode in episodes if episode in self._there and self._there[episode].rows]
         width = found[0].pictures.shape[1] if found else 0
         pictures = np.concatenate([np.zeros((0, width), np.float32), *(own.pictures for own in found)])

@@ -1,6 +1,6 @@
 """An episode with its moments: cut before every K-th call, and from that state every other policy drives on to the end."""
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,8 +15,9 @@ from osel_sim.formats.moments import SIGNALS, MomentRow
 from osel_sim.interface.encoder import Encoder
 from osel_sim.interface.environment import Environment
 from osel_sim.interface.instance import Instance
-from osel_sim.interface.monitor import DecisionPoint, Turn, Watched
+from osel_sim.interface.monitor import Candidate, DecisionPoint
 from osel_sim.interface.outcome import Outcome
+from osel_sim.selection.monitors.unseeing import NeverMonitor
 
 
 @dataclass(frozen=True)
@@ -45,20 +46,6 @@ class Moments:
     rows: tuple[MomentRow, ...]
     pictures: NDArray[np.float32]
     signals: NDArray[np.float64]
-
-
-class _Never:
-    """The monitor of an episode that is only looked at."""
-
-    def reset(self, instruction: str, driver: str, seed: tuple[int, ...]) -> None:
-        """Nothing to begin."""
-
-    def drives_on(self, point: DecisionPoint) -> Turn:
-        """The driver."""
-        return Turn(point.driver)
-
-    def learn(self, watched: Watched) -> None:
-        """Nothing to learn."""
 
 
 class _Cutter:
@@ -110,20 +97,20 @@ class MomentRunner:
             the outcome of the episode, as `run_episode` gives it without moments, and its moments.
         """
         drivers, cutter = self.drivers, _Cutter(self.cuts.most)
-        handoffs = Handoffs(drivers, self.policies, _Never(), self.cuts.every, env.specification.horizon or horizon, self.encoder, cutter)
+        never = NeverMonitor([Candidate(name, drivers[name].spec.is_remote) for name in self.policies], self.encoder.dimension, 0)
+        handoffs = Handoffs(drivers, self.policies, never, self.cuts.every, env.specification.horizon or horizon, self.encoder, cutter)
         driver, fallback = drivers[first], drivers.fallback(first)
         outcome = run_episode(env, instance, driver, fallback, repeat=repeat, action_noise=self.action_noise, handoffs=handoffs)
-        remote = {name for name in self.policies if drivers[name].spec.is_remote}
         rows = []
         for moment in cutter.moments:
             for second in (None, *(name for name in self.policies if name != first)):
                 then = outcome if second is None else go_on(moment, second)
-                rows.append(_row(instance.key, first, repeat, moment.point, second, then, remote))
+                rows.append(_row(instance.key, first, repeat, moment.point, second, then, never.remote))
         pictures = np.array(cutter.pictures, np.float32).reshape(-1, self.encoder.dimension)
         return replace(outcome, monitored=None), Moments(tuple(rows), pictures, np.array(cutter.signals, np.float64).reshape(-1, len(SIGNALS)))
 
 
-def _row(instance: str, first: str, repeat: int, point: DecisionPoint, second: str | None, outcome: Outcome, remote: set[str]) -> MomentRow:
+def _row(instance: str, first: str, repeat: int, point: DecisionPoint, second: str | None, outcome: Outcome, remote: Set[str]) -> MomentRow:
     by_policy = {} if outcome.monitored is None else outcome.monitored.by_policy
     own: dict[str, Any] = {name: value for name, value in vars(outcome).items() if name not in ("seconds", "monitored")}
     return MomentRow(

@@ -14,7 +14,7 @@ import numpy as np
 
 from osel_sim.core.errors import DataError
 from osel_sim.formats.toml_types import quoted
-from osel_sim.formats.values import AMOUNT, COUNT, NAME, PROPENSITIES, SHARE, TEXT, Kind, fault
+from osel_sim.formats.values import AMOUNT, COUNT, NAME, PROPENSITIES, SHARE, TEXT, Kind, fault, only
 from osel_sim.interface.monitor import DecisionPoint, Picture, Told, Turn
 
 POINTS = "points.jsonl"
@@ -22,7 +22,7 @@ VERSION = 1
 """Of the form of its lines."""
 
 _LINE = {
-    "version": Kind(f"{VERSION}", lambda value: value == VERSION and not isinstance(value, bool)),
+    "version": only(VERSION),
     "index": COUNT,
     "points": Kind("a list of objects", lambda value: isinstance(value, list) and all(isinstance(item, dict) for item in value)),
 }

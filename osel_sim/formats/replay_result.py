@@ -104,6 +104,7 @@ def write_replay(folder: Path, result: Mapping[str, Any], choices: Choices, tabl
                     (folder / f"{name}.csv").unlink(missing_ok=True)
             write_bytes(folder / CHOICES, content)
             write_json(folder / REPLAY, result)
+            drop_others(folder, REPLAY)
     except OSError as error:
         raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
 
@@ -142,8 +143,16 @@ def write_off_policy(folder: Path, found: Mapping[str, Any]) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / OFF_POLICY, {"schema_version": OFF_POLICY_VERSION, **found})
+        drop_others(folder, OFF_POLICY)
     except OSError as error:
         raise UsageError(f"--out {folder} cannot be written ({error.strerror})") from None
+
+
+def drop_others(folder: Path, own: str) -> None:
+    """Remove what a replay of another kind, which this one replaced, left in the folder: a page would be of that."""
+    for name in (REPLAY, OFF_POLICY, MOMENTS_RESULT):
+        if name != own:
+            (folder / name).unlink(missing_ok=True)
 
 
 def _npz(choices: Choices) -> bytes:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from osel_sim.formats.toml_types import quoted
+from osel_sim.interface.outcome import MONITORED_VERSION
 
 _LARGEST = 2**63
 """Integers are below it in the columns of a rollout log."""
@@ -43,6 +44,11 @@ AMOUNT = Kind("a finite number of 0 or more", lambda value: _is_number(value) an
 SHARE = Kind("a number in [0, 1]", lambda value: _is_number(value) and 0 <= value <= 1)
 
 
+def only(number: int) -> Kind:
+    """This number alone, such as the version of a form."""
+    return Kind(f"{number}", lambda value: type(value) is int and value == number)
+
+
 def _are_propensities(value: Any) -> bool:
     if not isinstance(value, dict) or not all(NAME.fits(name) and AMOUNT.fits(share) for name, share in value.items()):
         return False
@@ -75,13 +81,13 @@ _HANDOFF = {"step": COUNT, "call": COUNT, "from": NAME, "to": NAME, "why": TEXT}
 _DRIVING = {"steps": COUNT, **_USED}
 _DUTY = {"steps": SHARE, "calls": SHARE}
 _MONITORED = {
-    "version": Kind("1", lambda value: value == 1 and not isinstance(value, bool)),
+    "version": only(MONITORED_VERSION),
     "points": COUNT,
     "handoffs": Kind("a list", lambda value: isinstance(value, list)),
     "duty": Kind("an object of shares", lambda value: isinstance(value, dict) and fault(value, _DUTY) is None),
     "by_policy": Kind("an object", lambda value: isinstance(value, dict)),
 }
-MONITORED = Kind("version 1 of handoffs, duty and what each policy had of an episode", _is_monitored)
+MONITORED = Kind(f"version {MONITORED_VERSION} of handoffs, duty and what each policy had of an episode", _is_monitored)
 """Of `osel_sim.interface.outcome.Monitored`."""
 DECISION = {
     **{"index": COUNT, "task": NAME, "seed": COUNT, "level": COUNT, "axes": NAME.or_null, "split": NAME},

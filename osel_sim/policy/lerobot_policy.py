@@ -20,7 +20,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from torch import Tensor
 
 from osel_sim.core import content
-from osel_sim.core.errors import CheckpointError
+from osel_sim.core.errors import CheckpointError, PolicyError
 from osel_sim.core.hub import download, offline_if_unreachable, why_silent
 from osel_sim.core.torch_settings import threads
 from osel_sim.core.trust import ForeignCodeError, no_foreign_code, what_failed
@@ -114,8 +114,8 @@ class LeRobotPolicy:
     def act_batch(cls, sessions: Sequence["LeRobotPolicy"], observations: Sequence[Observation]) -> list[Actions]:
         """The next chunk of each session, with its own random numbers, in one pass of the network for all that are shown things of one shape."""
         shown = [split(observation) for observation in observations]
-        if any(len(steps) > 1 for steps in shown):  # LeRobot plans from such in queues of one session
-            return [session.act(observation) for session, observation in zip(sessions, observations, strict=True)]
+        if any(len(steps) > 1 for steps in shown):
+            raise PolicyError("it looks at several observations at a call, from which LeRobot plans in queues of one session")
         chunks: dict[int, Tensor] = {}
         with torch.inference_mode(), threads(1), no_foreign_code():
             prepared = [session._prepared(steps[0]) for session, steps in zip(sessions, shown, strict=True)]

@@ -79,7 +79,8 @@ def share_figure(result: Mapping[str, Any]) -> Figure | None:
 
 
 def _arrived(newcomers: Sequence[Mapping[str, Any]]) -> str:
-    return ", ".join(f"{newcomer['policy']} {newcomer['decisions']['through'] or 'never'}" for newcomer in newcomers)
+    after = [(newcomer["policy"], newcomer["decisions"]["through"]) for newcomer in newcomers]
+    return ", ".join(f"{policy} {'never' if decisions is None else decisions}" for policy, decisions in after)
 
 
 def _shown(result: Mapping[str, Any]) -> list[str]:

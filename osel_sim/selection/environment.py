@@ -55,16 +55,26 @@ class SelectionEnv(gymnasium.Env[NDArray[np.float32], np.int64]):
             gymnasium.error.ResetNeeded: called twice without `reset` in between.
             UsageError: the action is no index of a policy.
         """
-        try:
-            index = operator.index(-1 if isinstance(action, bool) else action)
-        except TypeError:
-            index = -1
-        if not 0 <= index < len(self.policies):
-            raise UsageError(f"an action must be the index of a policy, an integer in [0, {len(self.policies) - 1}], got {action!r}")
+        index = policy_index(action, len(self.policies))
         if self._round is None:
             raise gymnasium.error.ResetNeeded("an episode is one decision: call reset() before the next")
         (context, reward_of), self._round = self._round, None
         return context.copy(), float(reward_of(index)), True, False, {"policy": self.policies[index]}
+
+
+def policy_index(action: Any, policies: int) -> int:
+    """An action as the index of one of so many policies.
+
+    Raises:
+        UsageError: it is none.
+    """
+    try:
+        index = operator.index(-1 if isinstance(action, bool) else action)
+    except TypeError:
+        index = -1
+    if not 0 <= index < policies:
+        raise UsageError(f"an action must be the index of a policy, an integer in [0, {policies - 1}], got {action!r}")
+    return index
 
 
 def table_rounds(contexts: ArrayLike, rewards: ArrayLike, in_order: bool = False) -> Draw:

@@ -22,6 +22,7 @@ from osel_sim.formats.dataset_mapping import ACTION, STATE, DatasetMapping
 from osel_sim.ingestion.lerobot_check import INFO, open_dataset
 from osel_sim.ingestion.lerobot_files import DatasetFiles
 from osel_sim.ingestion.lerobot_numbers import actions, states
+from osel_sim.interface.instance import SUITE_SEPARATOR
 from osel_sim.policy.mapping import turned_over
 from osel_sim.training.annotations import ACTIONS, SIDE_FILE, Annotations, load_annotations
 
@@ -78,7 +79,7 @@ def load_demonstrations(folder: Path, cameras: tuple[str, ...], progress: bool =
     columns = {name: files.numbers(name, finite=False) for name in files.features if name.startswith("annotation.")}
     fingerprint = _fingerprint(folder, files.files, mapping)
     task = task_of(folder)
-    if task is not None and ":" in task:  # of another suite: its environment says what the numbers are, and its policies know no other
+    if task is not None and SUITE_SEPARATOR in task:  # of another suite: its environment says what the numbers are, and its policies know no other
         state, action = (files.numbers(name).astype(np.float32) for name in (STATE, ACTION))
     else:
         state, action = states(files, mapping), actions(files, mapping)

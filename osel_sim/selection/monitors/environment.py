@@ -1,6 +1,5 @@
 """The sequential problem as a Gymnasium environment, so that any stable-baselines3 algorithm runs on it: who drives on, at each decision point."""
 
-import operator
 from collections.abc import Callable, Generator, Sequence
 from typing import Any
 
@@ -10,6 +9,7 @@ from gymnasium.spaces import Box, Discrete
 from numpy.typing import NDArray
 
 from osel_sim.core.errors import UsageError
+from osel_sim.selection.environment import policy_index
 
 Row = NDArray[np.float32]
 """What is to be seen at a decision point: float32 (observation_dim,)."""
@@ -72,12 +72,7 @@ class HandoffEnv(gymnasium.Env[Row, np.int64]):
             gymnasium.error.ResetNeeded: the episode is over, or none was begun.
             UsageError: the action is no index of a policy.
         """
-        try:
-            index = operator.index(-1 if isinstance(action, bool) else action)
-        except TypeError:
-            index = -1
-        if not 0 <= index < len(self.policies):
-            raise UsageError(f"an action must be the index of a policy, an integer in [0, {len(self.policies) - 1}], got {action!r}")
+        index = policy_index(action, len(self.policies))
         if self._episode is None:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset() before the next step")
         told = {"policy": self.policies[index]}

@@ -1,6 +1,7 @@
 """Monitors by name. Listing them imports none: torch and stable-baselines3 come in with the monitor that needs them."""
 
 import inspect
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
@@ -64,7 +65,9 @@ def make_monitor(name: str, candidates: "Sequence[Candidate]", picture_dim: int,
         UnknownNameError: no such monitor, or a parameter names a policy that is not among the candidates.
         UsageError: it does not take these parameters.
     """
-    kind, *parameters = name.split(":")
+    from osel_sim.formats.merged_policy import MERGE  # imports pydantic, which a list does without
+
+    kind, *parameters = re.split(f"(?<!:{MERGE}):", name)  # a parameter may be the name of a merge, which has a colon of its own
     if kind not in MONITORS:
         raise UnknownNameError("monitor", name, MONITORS, "--list shows what they are")
     factory = MONITORS.load(kind)

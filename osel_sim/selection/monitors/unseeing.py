@@ -72,7 +72,7 @@ class RandomMonitor(MonitorBase):
         if not 0 < len(self.remote) < len(self.policies):
             raise UsageError("monitor random keeps the share of remote policies: it needs a remote and a local one among --policies")
         self._remote_steps = self._steps = 0.0  # of episodes that are over
-        self._since, self._driver, self._own = 0, "", 0.0  # of this one
+        self._since, self._own = 0, 0.0  # of this one
 
     @override
     def reset(self, instruction: str, driver: str, seed: tuple[int, ...]) -> None:
