@@ -100,6 +100,7 @@ def test_a_shard_goes_on_where_it_was_cut_off(recorded, shards, capsys):
     assert f"--shard: 1/2, but {folder / 'run.json'} is of 2/2" in capsys.readouterr().err
     world = recorded[0].parent
     assert record_main(["--resume", "--out", str(folder), "--tasks", str(world / "tasks"), "--policies-dir", str(world / "policies")]) == 0
+    assert f"osel_sim.merge {folder} OTHER_SHARDS --out LOG" in capsys.readouterr().out
     assert files(folder) == files(recorded[1][1])
 
 
