@@ -277,7 +277,7 @@ def test_it_is_asked_again_until_another_is_found_and_then_no_more(tmp_path):
         trial, now = EncoderTrial(tmp_path, encoders, judge, lambda encoder: None, asked_after=(4, 8, 16)), encoders[0]
         for count in range(1, until):
             if trial.due(count):
-                now = trial.ask([None] * count, ["a"], lambda encoder: np.zeros((count, 1), np.float32))
+                now = trial.ask([None] * count, ["a"], lambda encoder, count=count: np.zeros((count, 1), np.float32))
         return trial, now
 
     trial, now = go(6)

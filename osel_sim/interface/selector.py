@@ -83,7 +83,7 @@ class Pays(Protocol):
 
 @runtime_checkable
 class Recalls(Protocol):
-    """A selector that must be told of a choice that it did not make itself before `update` can be. Optional: a stranger's selector need not be one."""
+    """A selector that must be told of a choice that it did not make itself before `update`. Optional: a stranger's selector need not be one."""
 
     def recall(self, context: Context, policy: str, propensities: Mapping[str, float]) -> Choice:
         """The choice as if it had made it just now, to be passed to `update` next.
