@@ -24,6 +24,7 @@ from osel_sim.formats.journal import Decision, read_journal
 from osel_sim.interface.outcome import Seconds
 from osel_sim.run import main as run_main
 from osel_sim.selection.registry import make_selector
+from osel_sim.selection.state import load_state
 
 FIRST = ASKED_AFTER[0]
 TOTAL = FIRST + 4
@@ -127,15 +128,16 @@ def whole(world):
 def bytes_of(folder: Path) -> dict[str, bytes]:
     """What must not depend on how a run went."""
     run = json.loads((folder / "run.json").read_text())["configuration"]
-    files = {name: (folder / name).read_bytes() for name in ("episodes.jsonl", "contexts.npz", "selector.safetensors", CHECKS)}
-    return files | {"run.json": json.dumps(run).encode()}
+    files = {name: (folder / name).read_bytes() for name in ("episodes.jsonl", "contexts.npz", CHECKS)}
+    # The header of a tensor file has its keys in any order.
+    return files | {"run.json": json.dumps(run).encode(), "selector": repr(sorted(load_state(folder / "selector.safetensors").items())).encode()}
 
 
 def test_a_run_goes_on_with_the_encoder_that_tells_groups_apart(whole):
     [check] = read_checks(whole.folder)
     assert check.before == FIRST and check.final and check.choice.encoder == "solves@1"
     usual = check.choice.usual
-    assert usual.startswith("osel_small@") and check.choice.gains["solves@1"][0] > 0.3 > check.choice.gains[usual][0]
+    assert usual.startswith("osel_small@") and check.choice.gains["solves@1"][0] > 0.1 > check.choice.gains[usual][0]
     assert whole.summary["encoder"] == {"identity": "solves@1", "text": check.words} and "osel_small@" in check.words
     configuration = json.loads((whole.folder / "run.json").read_text())["configuration"]
     assert configuration["encoder"] == "solves@1" and configuration["encoders"] == candidates()
@@ -180,7 +182,7 @@ def test_a_run_that_has_not_asked_yet_says_when_it_will(world, tmp_path, capsys)
     assert run_main([*map(str, flags), "--out", str(tmp_path / "run")]) == 0
     assert f"is asked after {FIRST} decisions" in capsys.readouterr().out
     assert not (tmp_path / "run" / CHECKS).exists() and read_live(tmp_path / "run").outcomes.encoder.startswith("osel_small@")
-    assert run_main(["--out", str(tmp_path / "run"), "--resume", "--encoder", "osel_small", "--task", "toy:reach"]) == 2
+    assert run_main(["--out", str(tmp_path / "run"), "--resume", "--encoder", "osel_small"]) == 2
     assert "encoders was" in capsys.readouterr().err
 
 
