@@ -6,11 +6,13 @@ from typing import override
 from osel_sim.interface.monitor import Candidate, DecisionPoint, Turn
 from osel_sim.selection.monitors.base import MonitorBase, number
 
-STILL = 0.01
-"""A robot whose state changed by no more than this from one decision point to the next (root mean square over metres and radians) stands still."""
-SAME = 0.01
+STILL = 0.03
+"""A robot whose state changed by no more than this from one decision point to the next (root mean square over metres and radians) stands still.
+
+Like `SAME` and `LIMIT` chosen on the learning half of `assets/logs/moments`; see `docs/moments.md`."""
+SAME = 0.03
 """Images that differ by no more than this share of their range are the same."""
-LIMIT = 0.25
+LIMIT = 0.2
 """Chunks that differ by more than this share of half an action's range do not want the same thing."""
 
 
