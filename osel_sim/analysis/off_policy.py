@@ -16,7 +16,7 @@ from osel_sim.statistics.intervals import Interval
 
 LEAST_EFFECTIVE = 100.0
 """Estimates that rest on fewer effective decisions are shown nowhere: normal intervals of so few do not hold, and one lucky choice decides. In
-simulated runs of `auto`, `thompson`, `lints` and `random` 95 % intervals hold the truth in 95 to 97 % from here on, in 80 to 99 % of those that
+simulated runs of `auto`, `thompson`, `lints` and `random` 95 % intervals hold the truth in 95 % or more from here on, in 67 to 99 % of those that
 rest on fewer than 30 (`benchmarks/interval_coverage.py`)."""
 
 WAYS = ("ips", "snips", "dr")
