@@ -1,6 +1,6 @@
 """How often the intervals of off-policy estimates hold the truth, by how many effective decisions they rest on.
 
-    python benchmarks/interval_coverage.py [--runs 100] [--decisions 1000]
+    python benchmarks/interval_coverage.py [--runs 100] [--decisions 1000] [--first-seed 0]
 
 A simulated run: two policies, each good in one of two kinds of contexts, chosen between by `auto` (with its floor, and with a higher one),
 `thompson`, `lints` and `random`. From its propensities three targets are estimated: always the first policy, both equally often, and the better one
@@ -45,11 +45,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=100, help="of each selector")
     parser.add_argument("--decisions", type=int, default=1000, help="of a run; every other has half as many")
+    parser.add_argument("--first-seed", type=int, default=0)
     options = parser.parse_args()
     held: dict[tuple[int, str], list[bool]] = {}
     with progress(options.runs * len(LOGGERS), "run", "coverage") as bar:
         for name, settings in LOGGERS:
-            for seed in range(options.runs):
+            for seed in range(options.first_seed, options.first_seed + options.runs):
                 for found, truth in simulate(name, settings, seed, options.decisions // (1 + seed % 2)):
                     for way in WAYS:
                         interval = getattr(found, f"{way}_ci95")

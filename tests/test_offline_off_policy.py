@@ -93,3 +93,14 @@ def test_wrong_input():
         estimate([np.nan], [0], [[0.5, 0.5]], [[1.0, 0.0]])
     with pytest.raises(UsageError, match="no propensity"):
         estimate([1.0], [0], [[0.0, 1.0]], [[1.0, 0.0]])
+
+
+@pytest.mark.parametrize(("rare", "wider"), [(2, 2.0**0.5), (8, 1.0)])
+def test_a_rare_choice_that_was_not_made_often_enough_widens_intervals(rare, wider):
+    """Of 100 decisions 4 were to be the rare ones: where they are fewer, the sum of squared weights promised is scaled to, else nothing is."""
+    chosen = np.arange(100) < rare
+    propensities, target = np.tile([0.96, 0.04], (100, 1)), np.tile([0.0, 1.0], (100, 1))
+    rewards = np.arange(100) % 2.0
+    result = estimate(rewards, chosen, propensities, target)
+    plain = 1.959964 * (chosen / 0.04 * rewards).std(ddof=1) / 10.0
+    assert (result.ips_ci95[1] - result.ips_ci95[0]) / 2.0 == pytest.approx(wider * plain)

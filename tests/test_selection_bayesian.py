@@ -297,11 +297,12 @@ def test_bad_luck_at_the_beginning_is_overcome(name):
         assert chosen[-200:].count("worse") < 100
 
 
+@pytest.mark.parametrize("name", ["auto", "linucb_discounted"])
 @pytest.mark.parametrize(("scale", "shift"), [(0.01, 0.0), (30.0, 0.0), (1.0, 10.0), (0.1, -5.0)])
-def test_scale_and_offset_of_rewards_change_no_choice(scale, shift):
+def test_scale_and_offset_of_rewards_change_no_choice(name, scale, shift):
     contexts, rewards, _ = clusters(7, 300)
-    plain = play(make_selector("auto", POLICIES, 40, seed=0), contexts, rewards)
-    assert play(make_selector("auto", POLICIES, 40, seed=0), contexts, scale * rewards + shift).tolist() == plain.tolist()
+    plain = play(make_selector(name, POLICIES, 40, seed=0), contexts, rewards)
+    assert play(make_selector(name, POLICIES, 40, seed=0), contexts, scale * rewards + shift).tolist() == plain.tolist()
 
 
 def test_hard_contexts_are_not_held_against_the_usual_policy():

@@ -109,6 +109,20 @@ def test_a_policy_that_comes_back_is_remembered(name):
     assert selector.known == ("local", "remote") and (selector._counts == counts).all()
 
 
+@pytest.mark.parametrize("offset", [0.0, 10.0, -10.0])
+@pytest.mark.parametrize("name", ["auto", "linucb", "linucb_discounted", "thompson_window", "ucb1"])
+def test_a_better_newcomer_is_found_whatever_rewards_are(name, offset):
+    selector, generator, chosen = make(name), np.random.default_rng(3), []
+    for decision in range(200):
+        if decision == 60:
+            selector.add_policy("newcomer")
+        context = generator.normal(size=DIM).astype(np.float32)
+        choice = selector.select(context)
+        selector.update(context, choice, offset + float(generator.random() < {"local": 0.3, "remote": 0.5, "newcomer": 0.9}[choice.policy]))
+        chosen.append(choice.policy)
+    assert chosen[150:].count("newcomer") > 25
+
+
 class Stranger(SelectorBase):
     """A selector of somebody who knows of no columns."""
 

@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 from osel_sim.core.errors import UsageError
 from osel_sim.interface.selector import Choice, Context, State
 from osel_sim.selection.base import SelectorBase
+from osel_sim.selection.bayesian import DEVIATION
 from osel_sim.selection.scaling import RunningComponents
 
 Array = NDArray[np.float64]
+
+EQUAL = 1e-9
+"""Bounds no further apart, in standard deviations of the rewards, share a choice."""
 
 
 class DiscountedLinUCBSelector(SelectorBase):
@@ -23,11 +27,14 @@ class DiscountedLinUCBSelector(SelectorBase):
     weights are ridge regressions V^-1 b of discounted sums, and the deviation of a prediction is sqrt(x' V^-1 W V^-1 x), where W has the discount
     squared. The prior (`ridge` times the identity) is not forgotten, so that a policy that is not chosen becomes uncertain again and is tried.
 
+    Rewards are measured from the mean of all policies and in units of their standard deviation, both discounted: their scale and offset change
+    nothing, and a policy that joins, or that is forgotten, is believed to be as good as the others are.
+
     Args:
         policies, context_dim, seed: see `SelectorBase`. Only policies with equal bounds share a choice by chance.
         components: principal components of the contexts seen (`RunningComponents`), beside a constant.
         discount: in (0, 1]; about 1 / (1 - discount) decisions count.
-        optimism: >= 0.
+        optimism: >= 0, in standard deviations of the rewards.
         ridge: > 0.
 
     Raises:
@@ -46,7 +53,7 @@ class DiscountedLinUCBSelector(SelectorBase):
         *,
         components: int = 12,
         discount: float = 0.998,
-        optimism: float = 0.5,
+        optimism: float = 1.0,
         ridge: float = 2.0,
     ) -> None:
         super().__init__(policies, context_dim, seed)
@@ -65,6 +72,7 @@ class DiscountedLinUCBSelector(SelectorBase):
         self._space = RunningComponents(context_dim, components)
         shape = (len(self.policies), components + 1)
         self._products, self._squares, self._vectors = np.zeros((*shape, shape[1])), np.zeros((*shape, shape[1])), np.zeros(shape)
+        self._spread = 0.0  # discounted sum of squares of rewards about their mean
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -76,26 +84,50 @@ class DiscountedLinUCBSelector(SelectorBase):
         ridge = self._settings["ridge"] * np.eye(len(row))
         pulls = inverses @ row
         spread = np.sqrt(np.maximum(np.einsum("pi,pij,pj->p", pulls, self._squares + ridge, pulls), 0.0))
-        scores = np.einsum("pi,pi->p", pulls, self._vectors) + self._settings["optimism"] * spread - self._charged
+        unit = self._deviation()
+        scores = (self._means(pulls) - self._charged) / unit + self._settings["optimism"] * spread
         scores = scores[self.columns]
-        best = scores >= scores.max() - 1e-12
+        best = scores >= scores.max() - EQUAL
         shares = best / best.sum()
         index = int(self._generator.choice(len(self.policies), p=shares))
         return Choice(self.policies[index], dict(zip(self.policies, shares.tolist(), strict=True)))
 
     def _expected(self, context: Context) -> Array:
-        return np.asarray(np.einsum("pi,pi->p", self._inverses() @ self._row(context), self._vectors), np.float64)
+        return self._centre() + self._means(self._inverses() @ self._row(context))
 
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         discount, index = self._settings["discount"], self.known.index(choice.policy)
         self._space.add(context)
-        row = self._row(context)
+        row, (before, mean) = self._row(context), self._all()
+        self._spread = discount * (self._spread + before / (discount * before + 1.0) * (reward - mean) ** 2)
         self._products *= discount
         self._squares *= discount**2
         self._vectors *= discount
         self._products[index] += np.outer(row, row)
         self._squares[index] += np.outer(row, row)
         self._vectors[index] += reward * row
+
+    def _all(self) -> tuple[float, float]:
+        """How many decisions count, and their mean reward."""
+        count = float(self._products[:, 0, 0].sum())
+        return count, float(self._vectors[:, 0].sum() / count) if count > 0.0 else 0.0
+
+    def _centre(self) -> float:
+        """Mean reward of the policies that were chosen, each with one decision's weight of the mean over decisions: how good the most chosen one is
+        says little of the others."""
+        count, mean = self._all()
+        counts = self._products[:, 0, 0]
+        return float(((self._vectors[:, 0] + mean) / (counts + 1.0))[counts > 0.0].mean()) if count > 0.0 else 0.0
+
+    def _deviation(self) -> float:
+        """Standard deviation of rewards; a guess until two of them differ."""
+        count, mean = self._all()
+        deviation = math.sqrt(self._spread / count) if count > 0.0 else 0.0
+        return deviation if deviation > 1e-9 * abs(mean) else DEVIATION
+
+    def _means(self, pulls: Array) -> Array:
+        """Expected rewards (P,) less the centre, given each policy's V^-1 x."""
+        return np.asarray(np.einsum("pi,pi->p", pulls, self._vectors - self._centre() * self._products[:, :, 0]), np.float64)
 
     def _row(self, context: Context) -> Array:
         return np.concatenate([[1.0], self._space.transform(context).astype(np.float64)])
@@ -111,10 +143,11 @@ class DiscountedLinUCBSelector(SelectorBase):
         self._vectors = np.concatenate([self._vectors, np.zeros((1, width))])
 
     def _state(self) -> State:
-        own = {"products": self._products.copy(), "squares": self._squares.copy(), "vectors": self._vectors.copy()}
+        own = {"products": self._products.copy(), "squares": self._squares.copy(), "vectors": self._vectors.copy(), "spread": self._spread}
         return {**own, **self._space.state(), "random": self._generator.bit_generator.state}
 
     def _load(self, state: State) -> None:
         self._products, self._squares, self._vectors = (state[key].copy() for key in ("products", "squares", "vectors"))
+        self._spread = state["spread"]
         self._space.load(state)
         self._generator.bit_generator.state = state["random"]
