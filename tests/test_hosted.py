@@ -152,8 +152,6 @@ def test_any_websocket_client_with_the_token_is_answered_and_no_other(host):
         with pytest.raises(InvalidStatus, match="401"):
             stock_connect(host.url, additional_headers=headers, proxy=None)
     with stock_connect(host.url, additional_headers={"Authorization": f"Api-Key {host.token}"}, proxy=None) as client:
-        assert unpack(client.recv())["suite"] == "toy"
-        assert client.ping().wait(5.0)
         client.send(pack({"do": "open", "task": "line"}))
         assert unpack(client.recv())["env"] == 0
     assert host.ask({"do": "open", "task": "line"})["env"] == 0, "another client may come when one has gone"

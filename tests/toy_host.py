@@ -65,6 +65,7 @@ def misbehave(ready: int, manners: str) -> None:
             time.sleep(60)
         connection, _ = listener.accept()
         wire = Wire.accept(connection, os.environ[TOKEN_VARIABLE], 10.0)
+        wire.receive()
         wire.send(pack({"protocol": "another/1" if manners == "foreign" else PROTOCOL}))
         wire.receive()
         text = b"\x81\x02no"

@@ -74,6 +74,8 @@ class Table:
             Exception: whatever the simulator raises.
         """
         match message["do"]:
+            case "greet":
+                return {"protocol": PROTOCOL}
             case "open":
                 return self._open(message["task"])
             case "describe":
@@ -168,20 +170,19 @@ def serve(suite: str, ready: int) -> None:
         while True:
             connection, _ = listener.accept()
             with connection, contextlib.suppress(OSError, WebSocketException, ProtocolError):  # whoever it was hung up, or was turned away
-                converse(Wire.accept(connection, token, HANDSHAKE_SECONDS), suite, table)
+                converse(Wire.accept(connection, token, HANDSHAKE_SECONDS), table)
 
 
-def converse(wire: Wire, suite: str, table: Table) -> None:
+def converse(wire: Wire, table: Table) -> None:
     """Answer messages until the other end hangs up."""
     try:
-        wire.send(pack({"protocol": PROTOCOL, "suite": suite}))
         while True:
             wire.send(_reply(table, wire.receive()))
     finally:
         table.close()
 
 
-def _reply(table: Table, frame: bytes) -> bytes:
+def _reply(table: Table, frame: memoryview) -> bytes:
     """The answer to one message; what goes wrong is told, and the connection goes on."""
     try:
         return packed(table.answer(unpack(frame)))

@@ -60,11 +60,6 @@ class Host(ServerProcess):
         """The command line that starts it."""
         return [str(self._where.python), "-I", str(BOOT), self._suite, str(ready)]
 
-    @property
-    def alive(self) -> bool:
-        """Whether it can be asked something."""
-        return self._wire is not None and self.running
-
     def ask(self, message: Message, life: int | None = None) -> Message:
         """The answer to one message.
 
@@ -79,11 +74,12 @@ class Host(ServerProcess):
             ProtocolError: the message cannot be sent.
         """
         with self._lock:
-            if life is not None and (life != self.life or not self.alive):
+            wire = self._wire if self.running else None
+            if life is not None and (life != self.life or wire is None):
                 raise self._gone("has ended") if life == self.life else HostGoneError(f"{self._what} has ended")
             question = packed(message)
             try:
-                wire = self._connect()
+                wire = wire or self._connect()
                 wire.send(question, ANSWER_SECONDS)
                 answer = _message(wire.receive(ANSWER_SECONDS))
             except TimeoutError:
@@ -110,12 +106,11 @@ class Host(ServerProcess):
         super().close()
 
     def _connect(self) -> Wire:
-        if self._wire is not None and self.running:
-            return self._wire
         self.close()
         try:
             self.start()
             self._wire = Wire.connect(self.url, self.token, START_SECONDS)
+            self._wire.send(packed({"do": "greet"}), START_SECONDS)
             greeting = _message(self._wire.receive(START_SECONDS))
         except (OSError, WebSocketException, ProtocolError, RemoteError) as error:
             raise self._gone(str(error).removeprefix(f"{self._what} ")) from None
@@ -317,7 +312,7 @@ def describe(suite: str, task: str, place: str | None = None, here: bool = False
     return dict(module_of(suite).describe(task) if host is None else host.ask({"do": "describe", "task": task})["description"])
 
 
-def _message(frame: bytes) -> Message:
+def _message(frame: memoryview) -> Message:
     message = unpack(frame)
     if not isinstance(message, dict):
         raise ProtocolError(f"expected a map, got {type(message).__name__}")
