@@ -39,8 +39,9 @@ def test_every_allowed_dtype_survives(dtype):
 
 
 def test_a_non_contiguous_array_keeps_its_meaning():
-    array = np.arange(24, dtype=np.float32).reshape(4, 6)[::2, ::-1].T
-    assert same(unpack(pack(array)), array)
+    array = np.arange(24, dtype=np.float32).reshape(4, 6)
+    for view in (array[::2, ::-1].T, array.T, np.asfortranarray(array)):
+        assert same(unpack(memoryview(pack(view))), view)
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def pack(message: Any) -> bytes:
     return packed
 
 
-def unpack(frame: bytes) -> Any:
+def unpack(frame: bytes | memoryview) -> Any:
     """The message of one frame. Its arrays are read-only views of the frame.
 
     Raises:
@@ -64,7 +64,8 @@ def _to_wire(value: Any) -> dict[bytes, Any]:
     if value.dtype.str not in DTYPES:
         raise TypeError(f"dtype {value.dtype} has no wire form")
     if isinstance(value, np.ndarray):
-        return {b"__ndarray__": True, b"data": value.tobytes(), b"dtype": value.dtype.str, b"shape": value.shape}
+        data = value.data if value.flags.c_contiguous else value.tobytes()
+        return {b"__ndarray__": True, b"data": data, b"dtype": value.dtype.str, b"shape": value.shape}
     return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
 
 

@@ -1,39 +1,37 @@
 """The host process of a suite: its simulator, behind the wire that policies have. `osel_sim.suites.hosted` is the other end.
 
 It runs in the suite's own Python environment, so nothing is imported here that needs more than numpy, msgpack and websockets. There is one
-connection, and one thread that does everything: what draws must not change threads. A message is a map with what to `do`, and is answered with a map;
-after every message that may change an environment the answer says how it stands (`status`).
+connection at a time, and one thread that does everything: what draws must not change threads. A message is a map with what to `do`, and is answered
+with a map; after every message that may change an environment the answer says how it stands (`status`).
 
 `osel_sim.suites.NAME.env` knows how to make environments: `open_environment(task)` returns one, whose snapshots are plain data (numbers, texts,
 arrays, lists and maps of such), and `describe(task)`, where there is one, says as plain data what nobody knows without the simulator.
 """
 
-import hmac
+import contextlib
 import json
 import os
+import socket
 import threading
 import traceback
 from collections.abc import Callable, Mapping
-from http import HTTPStatus
 from importlib import import_module
 from typing import Any
 
 import numpy as np
-from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request, Response
-from websockets.sync.server import ServerConnection
-from websockets.sync.server import serve as listen
+from websockets.exceptions import WebSocketException
 
 from osel_sim.core.errors import OselError
 from osel_sim.core.shown import TOKEN_VARIABLE
 from osel_sim.interface.environment import Environment, Expert, HasExpert, TellsLandmarks, TellsScene
-from osel_sim.remote.codec import pack, unpack
+from osel_sim.remote.codec import ProtocolError, pack, unpack
 from osel_sim.remote.serving import stop_with_stdin
 from osel_sim.suites.base import PlainInstance
+from osel_sim.suites.wire import LARGEST, Wire
 
 PROTOCOL = "osel_sim.suite/1"
-LARGEST = 64 << 20
-"""Bytes of a message: six images of 1,024 pixels have 19 million."""
+HANDSHAKE_SECONDS = 10.0
+"""Whoever has connected and says nothing keeps others waiting for so long."""
 
 Message = dict[str, Any]
 
@@ -76,6 +74,8 @@ class Table:
             Exception: whatever the simulator raises.
         """
         match message["do"]:
+            case "greet":
+                return {"protocol": PROTOCOL}
             case "open":
                 return self._open(message["task"])
             case "describe":
@@ -139,6 +139,18 @@ def advance_chunk(env: Environment, actions: Any) -> int:
     return len(actions)
 
 
+def packed(message: Message) -> bytes:
+    """One message, as it goes over the wire.
+
+    Raises:
+        ProtocolError: it holds something that has no wire form, or is too long.
+    """
+    frame = pack(message)
+    if len(frame) > LARGEST:
+        raise ProtocolError(f"cannot be sent: it has {len(frame):,} bytes, more than {LARGEST:,}")
+    return frame
+
+
 def serve(suite: str, ready: int) -> None:
     """Serve until standard input ends.
 
@@ -150,37 +162,30 @@ def serve(suite: str, ready: int) -> None:
     parent = os.dup(0)
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)  # a simulator that asks its user something (LIBERO does) must fail, not wait
     threading.Thread(target=stop_with_stdin, args=(parent,), daemon=True).start()
-    authorization = f"Api-Key {os.environ.pop(TOKEN_VARIABLE)}".encode()
+    token = os.environ.pop(TOKEN_VARIABLE)
     table = Table(module_of(suite))
-
-    def check(connection: ServerConnection, request: Request) -> Response | None:
-        given = request.headers.get_all("Authorization")
-        if len(given) != 1 or not hmac.compare_digest(given[0].encode("utf-8", "surrogateescape"), authorization):
-            return connection.respond(HTTPStatus.UNAUTHORIZED, "a token is needed\n")
-        return None
-
-    def converse(connection: ServerConnection) -> None:
-        try:
-            connection.send(pack({"protocol": PROTOCOL, "suite": suite}))
-            for frame in connection:
-                connection.send(_reply(table, frame))
-        except ConnectionClosed:
-            pass
-        finally:
-            table.close()
-
-    options: dict[str, Any] = {"compression": None, "max_size": LARGEST, "ping_interval": None}
-    with listen(converse, "127.0.0.1", 0, process_request=check, **options) as server:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
         with os.fdopen(ready, "w") as out:
-            out.write(json.dumps({"url": f"ws://127.0.0.1:{server.socket.getsockname()[1]}"}) + "\n")
-        server.serve_forever()
+            out.write(json.dumps({"url": f"ws://127.0.0.1:{listener.getsockname()[1]}"}) + "\n")
+        while True:
+            connection, _ = listener.accept()
+            with connection, contextlib.suppress(OSError, WebSocketException, ProtocolError):  # whoever it was hung up, or was turned away
+                converse(Wire.accept(connection, token, HANDSHAKE_SECONDS), table)
 
 
-def _reply(table: Table, frame: str | bytes) -> bytes:
+def converse(wire: Wire, table: Table) -> None:
+    """Answer messages until the other end hangs up."""
+    try:
+        while True:
+            wire.send(_reply(table, wire.receive()))
+    finally:
+        table.close()
+
+
+def _reply(table: Table, frame: memoryview) -> bytes:
     """The answer to one message; what goes wrong is told, and the connection goes on."""
     try:
-        message = unpack(frame if isinstance(frame, bytes) else frame.encode())
-        return pack(table.answer(message))
+        return packed(table.answer(unpack(frame)))
     except OselError as error:
         return pack({"refused": str(error)})
     except ModuleNotFoundError as error:

@@ -16,23 +16,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from websockets.exceptions import WebSocketException
-from websockets.sync.client import ClientConnection, connect
 
 from osel_sim.core.errors import MissingPackageError, RemoteError, SuiteHostError, UsageError
 from osel_sim.interface.environment import Environment, EnvironmentSpec, Image
 from osel_sim.interface.policy import Actions, Observation
-from osel_sim.remote.codec import ProtocolError, pack, unpack
+from osel_sim.remote.codec import ProtocolError, unpack
 from osel_sim.remote.process import ServerProcess
 from osel_sim.sim.gl import choose_backend
 from osel_sim.suites.base import PlainInstance
 from osel_sim.suites.environments import SuiteEnvironment, environment
-from osel_sim.suites.host import LARGEST, PROTOCOL, Message, module_of
+from osel_sim.suites.host import PROTOCOL, Message, module_of, packed
+from osel_sim.suites.wire import Wire
 
 BOOT = Path(__file__).resolve().parent / "boot.py"
 START_SECONDS = 120.0
 ANSWER_SECONDS = 300.0
 """A simulator that compiles a scene, or makes its meshes light for the first time, takes its time."""
-CLOSE_SECONDS = 1.0
 
 
 class HostGoneError(SuiteHostError):
@@ -53,19 +52,13 @@ class Host(ServerProcess):
     def __init__(self, suite: str, where: SuiteEnvironment) -> None:
         super().__init__(f"the host of suite {suite!r}", START_SECONDS)
         self._suite, self._where = suite, where
-        self._connection: ClientConnection | None = None
-        self._hang_up = contextlib.ExitStack()
+        self._wire: Wire | None = None
         self._lock = threading.Lock()
         self.life = 0
 
     def command(self, ready: int) -> list[str]:
         """The command line that starts it."""
         return [str(self._where.python), "-I", str(BOOT), self._suite, str(ready)]
-
-    @property
-    def alive(self) -> bool:
-        """Whether it can be asked something."""
-        return self._connection is not None and self.running
 
     def ask(self, message: Message, life: int | None = None) -> Message:
         """The answer to one message.
@@ -78,18 +71,24 @@ class Host(ServerProcess):
             MissingPackageError: what was asked for needs a package that its environment does not have.
             UsageError: it refuses, since something is wrong with what was asked for.
             SuiteHostError: the simulator failed.
+            ProtocolError: the message cannot be sent.
         """
         with self._lock:
-            if life is not None and (life != self.life or not self.alive):
+            wire = self._wire if self.running else None
+            if life is not None and (life != self.life or wire is None):
                 raise self._gone("has ended") if life == self.life else HostGoneError(f"{self._what} has ended")
-            connection = self._connect()
+            question = packed(message)
             try:
-                connection.send(pack(message))
-                answer = unpack(_bytes(connection.recv(timeout=ANSWER_SECONDS)))
+                wire = wire or self._connect()
+                wire.send(question, ANSWER_SECONDS)
+                answer = _message(wire.receive(ANSWER_SECONDS))
             except TimeoutError:
                 raise self._gone(f"does not answer within {ANSWER_SECONDS:g} s") from None
             except (OSError, WebSocketException, ProtocolError) as error:
-                raise self._gone("has ended" if not self.running else f"hung up ({error})") from None
+                raise self._gone(f"hung up ({error})") from None
+            except BaseException:
+                self.close()  # interrupted: an answer that comes later must not be taken for that to the next question
+                raise
         if "missing" in answer:
             package = answer["missing"]
             raise MissingPackageError(f"suite {self._suite!r}", package, f"uv pip install --python {self._where.python} {package}")
@@ -97,43 +96,34 @@ class Host(ServerProcess):
             raise UsageError(answer["refused"])
         if "failed" in answer:
             raise SuiteHostError(f"{self._what}: {answer['failed']}")
-        return dict(answer)
+        return answer
 
     def close(self) -> None:
         """End it. May be called twice."""
-        self._connection = None
-        with contextlib.suppress(OSError, WebSocketException):
-            self._hang_up.close()
+        wire, self._wire = self._wire, None
+        if wire is not None:
+            wire.close()
         super().close()
 
-    def _connect(self) -> ClientConnection:
-        if self._connection is not None and self.running:
-            return self._connection
+    def _connect(self) -> Wire:
         self.close()
         try:
             self.start()
-            opening = connect(
-                self.url,
-                additional_headers={"Authorization": f"Api-Key {self.token}"},
-                compression=None,
-                max_size=LARGEST,
-                close_timeout=CLOSE_SECONDS,
-                ping_interval=None,
-                proxy=None,
-            )
-            connection = self._hang_up.enter_context(opening)
-            greeting = unpack(_bytes(connection.recv(timeout=START_SECONDS)))
+            self._wire = Wire.connect(self.url, self.token, START_SECONDS)
+            self._wire.send(packed({"do": "greet"}), START_SECONDS)
+            greeting = _message(self._wire.receive(START_SECONDS))
         except (OSError, WebSocketException, ProtocolError, RemoteError) as error:
             raise self._gone(str(error).removeprefix(f"{self._what} ")) from None
         if greeting.get("protocol") != PROTOCOL:
             raise self._gone(f"speaks {str(greeting)[:80]}, expected {PROTOCOL}")
-        self._connection, self.life = connection, self.life + 1
-        return connection
+        self.life += 1
+        return self._wire
 
     def _gone(self, reason: str) -> HostGoneError:
-        error = HostGoneError(f"{self._what} {reason}{self._last_lines()}")
+        lines = self._last_lines()  # waits for its end, where that is under way
+        ended = self.pid is not None and not self.running
         self.close()
-        return error
+        return HostGoneError(f"{self._what} {'has ended' if ended else reason}{lines}")
 
 
 @functools.cache
@@ -322,6 +312,13 @@ def describe(suite: str, task: str, place: str | None = None, here: bool = False
     return dict(module_of(suite).describe(task) if host is None else host.ask({"do": "describe", "task": task})["description"])
 
 
+def _message(frame: memoryview) -> Message:
+    message = unpack(frame)
+    if not isinstance(message, dict):
+        raise ProtocolError(f"expected a map, got {type(message).__name__}")
+    return message
+
+
 def _host(suite: str, place: str | None, here: bool) -> Host | None:
     """The host that a suite runs in; None: this process."""
     choose_backend()  # before MuJoCo is imported, here or there: it looks only once
@@ -330,7 +327,3 @@ def _host(suite: str, place: str | None, here: bool) -> Host | None:
         return None
     where.require(suite)
     return host_of(suite, where.name)
-
-
-def _bytes(frame: str | bytes) -> bytes:
-    return frame if isinstance(frame, bytes) else frame.encode()
