@@ -12,6 +12,7 @@ from typing import Any, Literal, cast
 
 import altair as alt
 import numpy as np
+from altair.utils.schemapi import debug_mode
 from numpy.typing import ArrayLike
 
 from osel_sim.core.errors import UsageError
@@ -48,6 +49,9 @@ CONFIG: dict[str, Any] = {
 """Look of every figure, in the colours of the light theme."""
 
 Panel = alt.LayerChart
+
+unchecked = debug_mode(False)
+"""Decorator of what draws many charts: Altair does not check each part against its schema, a tenth of a page's time. The tests check all of it."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +133,7 @@ class Figure:
     one_legend: bool = True
 
     @cached_property
+    @unchecked
     def chart(self) -> alt.ConcatChart:
         """All of it as one Altair chart."""
         width = WIDTH if len(self.panels) > 1 else WIDE
@@ -197,7 +202,7 @@ def unfolded(*records: Mapping[str, Any]) -> alt.Chart:
             hides it by.
     """
     wide: list[str | alt.FieldName] = [key for key, value in records[0].items() if isinstance(value, list)]
-    base = alt.Chart(alt.InlineData(values=[dict(record) for record in records]))
+    base = alt.Chart(alt.InlineData(values=tuple(map(dict, records))))  # a list would be copied with its numbers, again and again
     # Names that have a column of their own come with it: they are hidden after it is unfolded.
     shown = base.transform_filter(SHOWN) if "name" in records[0] and "name" not in wide else base
     return shown.transform_flatten(wide)
