@@ -12,7 +12,6 @@ from typing import Any, Literal, cast
 
 import altair as alt
 import numpy as np
-from altair.utils.schemapi import debug_mode
 from numpy.typing import ArrayLike
 
 from osel_sim.core.errors import UsageError
@@ -49,9 +48,6 @@ CONFIG: dict[str, Any] = {
 """Look of every figure, in the colours of the light theme."""
 
 Panel = alt.LayerChart
-
-unchecked = debug_mode(False)
-"""Decorator of what draws many charts: Altair does not check each part against its schema, a tenth of a page's time. The tests check all of it."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +129,6 @@ class Figure:
     one_legend: bool = True
 
     @cached_property
-    @unchecked
     def chart(self) -> alt.ConcatChart:
         """All of it as one Altair chart."""
         width = WIDTH if len(self.panels) > 1 else WIDE

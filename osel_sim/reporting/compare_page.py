@@ -8,7 +8,7 @@ import altair as alt
 
 from osel_sim.analysis.estimate import Estimate
 from osel_sim.formats.compare_result import read_compare
-from osel_sim.reporting.charts import Figure, Look, Panel, listed, unchecked
+from osel_sim.reporting.charts import Figure, Look, Panel, listed
 from osel_sim.reporting.comparison import SHARES, losses_first, notes, probability
 from osel_sim.reporting.dots import rows
 from osel_sim.reporting.html_tables import Cell, Column, Table
@@ -36,7 +36,6 @@ def compare_page(folder: Path) -> Page:
     return page_of(read_compare(folder), folder)
 
 
-@unchecked
 def page_of(result: Mapping[str, Any], folder: Path) -> Page:
     """The page of a comparison, as `compare.json` has it; `folder`: where that lies."""
     names = [policy["name"] for policy in result["policies"]]

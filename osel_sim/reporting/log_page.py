@@ -11,7 +11,6 @@ from osel_sim.analysis.logged_choices import choices_of, has_choices
 from osel_sim.analysis.outcomes import overall, remote_policies
 from osel_sim.core.errors import DataError
 from osel_sim.formats.rollout_log import Row, read_rollouts
-from osel_sim.reporting.charts import unchecked
 from osel_sim.reporting.cluster_sections import Replayed, Routing, analyse, cluster_blocks, frontier_figure, weights_blocks
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_sections import context_figure, formula, policy_blocks, rates_table, time_figure
@@ -22,7 +21,6 @@ from osel_sim.reporting.verdict_tiles import shown_verdict
 from osel_sim.selection.reward import RewardWeights
 
 
-@unchecked
 def log_page(log: LoggedOutcomes, weights: RewardWeights, scenes: Scenes = no_scenes, rows: Sequence[Row] | None = None) -> Page:
     """The page of a rollout log: what its policies came to, and whether there is something to route by.
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from osel_sim.analysis.estimate import Estimate
 from osel_sim.formats.moments_result import read_moments_result
-from osel_sim.reporting.charts import Figure, Look, Panel, listed, unchecked
+from osel_sim.reporting.charts import Figure, Look, Panel, listed
 from osel_sim.reporting.curves import Line, curves
 from osel_sim.reporting.dots import Dot, certain, scatter
 from osel_sim.reporting.html_tables import Cell, Column, Table
@@ -23,7 +23,6 @@ MOST_TASKS = 12
 """Panels of the curves of gains; `gains.csv` has all."""
 
 
-@unchecked
 def moments_page(folder: Path) -> Page:
     """The page of the replay of moments in a folder.
 

@@ -21,7 +21,7 @@ from osel_sim.formats.replay_result import CHANGES, PENDING, REPLAY, Choices, re
 from osel_sim.formats.rollout_log import read_rollouts
 from osel_sim.reporting.budget_section import replay_budget
 from osel_sim.reporting.changing_page import changing_page, reward_figure
-from osel_sim.reporting.charts import Figure, Look, unchecked
+from osel_sim.reporting.charts import Figure, Look
 from osel_sim.reporting.cluster_sections import Replayed
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, notes_of
 from osel_sim.reporting.log_page import bounds, few, log_facts, log_sections, signed
@@ -61,7 +61,6 @@ class ReplayOptions:
     scenes: Scenes = no_scenes
 
 
-@unchecked
 def replay_page(folder: Path, options: ReplayOptions) -> Page:
     """The page of a replay's folder.
 

@@ -21,7 +21,7 @@ from osel_sim.formats.journal import Decision
 from osel_sim.formats.run_config import read_run
 from osel_sim.reporting.budget_section import run_budget
 from osel_sim.reporting.changes_section import changes_table
-from osel_sim.reporting.charts import Figure, Look, listed, unchecked
+from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, thinned
 from osel_sim.reporting.encoder_section import encoder_section
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, note_of
@@ -46,7 +46,6 @@ ERROR = 0.05
 """Probability, at most, that the bounds of the verdict do not hold."""
 
 
-@unchecked
 def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = None, budget: int = BUDGET) -> Page:
     """The page of a live run's folder.
 
