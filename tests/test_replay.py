@@ -307,7 +307,7 @@ def test_a_selector_sees_the_outcomes_of_its_choices_only(log, monkeypatch):
 
 def test_a_verdict_comes_first_and_all_is_written_as_it_comes(tmp_path: Path, log, capsys, monkeypatch):
     """Interrupted while it replays what comes last, a replay leaves all that was told before; in the end nothing tells that it came in stages."""
-    settings = {"seeds": 2, "decisions": 60, "workers": 1, "alpha_time": 0, "alpha_price": 0.1}
+    settings = {"seeds": 2, "decisions": 30, "workers": 1, "alpha_time": 0, "alpha_price": 0.1}
     told = []
 
     def tell(result):

@@ -197,7 +197,7 @@ def unfolded(*records: Mapping[str, Any]) -> alt.Chart:
             hides it by.
     """
     wide: list[str | alt.FieldName] = [key for key, value in records[0].items() if isinstance(value, list)]
-    base = alt.Chart(alt.InlineData(values=[dict(record) for record in records]))
+    base = alt.Chart(alt.InlineData(values=tuple(map(dict, records))))  # a list would be copied with its numbers, again and again
     # Names that have a column of their own come with it: they are hidden after it is unfolded.
     shown = base.transform_filter(SHOWN) if "name" in records[0] and "name" not in wide else base
     return shown.transform_flatten(wide)

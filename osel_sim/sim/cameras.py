@@ -99,6 +99,7 @@ class _Renderer:
         if quality == "fast":
             # Boxes of 4 x 4 quads a side and cylinders of 28 x 16 are most of what is left to draw once the meshes are light.
             visual.quality.offsamples, visual.quality.numquads, visual.quality.numslices, visual.quality.numstacks = 0, 1, 16, 4
+            visual.quality.shadowsize = 0  # none is drawn: no map of 4096 x 4096 for them
         self._gl = gl.context(LARGEST, LARGEST)
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
