@@ -12,6 +12,7 @@ from osel_sim.formats.journal import JOURNAL, TIMING, read_journal
 from osel_sim.formats.points import POINTS, to_points
 from osel_sim.formats.run_config import RUN
 from osel_sim.interface.monitor import Candidate
+from osel_sim.reporting.run_page import run_page
 from osel_sim.run import main
 from osel_sim.selection.monitors.registry import MONITORS, make_monitor
 
@@ -114,3 +115,23 @@ def test_other_packages_bring_monitors(tmp_path, monkeypatch):
     assert make_monitor("nervous:7", candidates, 1, 0).limit == "7"
     assert type(make_monitor("never", candidates, 1, 0)).__name__ == "NeverMonitor"
     sys.modules.pop("nervous")
+
+
+@pytest.mark.slow
+def test_its_page_shows_who_drove_and_what_the_same_choices_come_to_without_it(run):
+    folder, _ = run
+    decisions = read_journal(folder / JOURNAL)
+    page = run_page(folder)
+    section = next(section for section in page.sections if section.name == "handoffs")
+    figure, driving, compared = section.blocks
+    assert figure.caption.startswith(f"{EPISODES} episodes")
+    drawn = next(iter(figure.spec["datasets"].values()))
+    assert len(drawn) == sum(1 + len(decision.monitored.handoffs) for decision in decisions)
+    assert max(row["to"] for row in drawn) == max(decision.steps for decision in decisions)
+    assert {row["policy"] for row in driving.rows} == {"calm", "wild"} and sum(row["steps"] for row in driving.rows) == pytest.approx(1.0)
+    assert sum(row["took"] for row in driving.rows) == sum(len(decision.monitored.handoffs) for decision in decisions)
+    received = json.loads((folder / "summary.json").read_text())
+    assert page.verdict.tiles[0].value == f"{received['mean_reward']:.3f}"  # what the run came to, not what it would have without the monitor
+    summary = received["monitor"]
+    assert compared.rows[0]["duty"] == pytest.approx(summary["duty_steps"]) and compared.rows[0]["reward"].value == pytest.approx(summary["with"])
+    assert compared.rows[1]["reward"].value == pytest.approx(summary["without"])

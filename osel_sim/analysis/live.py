@@ -1,7 +1,7 @@
 """A live run's folder as material for offline evaluation: what was chosen, with which probability, and what came of it."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,7 @@ class LiveLog:
         propensities: (T, P) with which each policy would have been chosen.
         selector: name of the selector that chose.
         reward: weights that the run was made with, as `RewardWeights` takes them.
+        received: as `outcomes`, but of the policies that were chosen what the run itself came to: a monitor may have handed over.
         changes: policies that joined and left; `outcomes` has all that ever were, of which one that was not there has the propensity 0.
     """
 
@@ -47,6 +48,7 @@ class LiveLog:
     propensities: Array
     selector: str
     reward: dict[str, Any]
+    received: LoggedOutcomes
     changes: tuple[PolicyChange, ...] = ()
 
     def has_all_outcomes(self, weights: RewardWeights) -> bool:
@@ -87,6 +89,7 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
         LoggedInstance(decision.instance, **{name: getattr(decision, name) for name in ABOUT if name != "axes"}) for decision in decisions
     )
     own = [decision.outcome for decision in decisions]
+    alone = list(own)
     rows: list[Row] = []
     for decision, (data, _) in zip(decisions, read_lines(folder / COUNTERFACTUAL), strict=False):  # a killed run may have one line more
         there = available(initial, changes, decision.index)
@@ -96,18 +99,23 @@ def read_live(folder: Path, encoder: str | None = None) -> LiveLog:
             rows.append(_row(decision, policy, outcome))
         if others.alone is not None:  # what a monitor made of it is not the policy's own, which the others are compared with
             check_reward(others.alone_reward, others.alone, weights, f"{folder / COUNTERFACTUAL}, line {decision.index + 1}: alone")
-            own[decision.index] = others.alone
-    rows += [_row(decision, decision.policy, outcome) for decision, outcome in zip(decisions, own, strict=True)]
+            alone[decision.index] = others.alone
     if (folder / COUNTERFACTUAL).exists() or configuration.get("counterfactual") is True:
         check_beside(folder / COUNTERFACTUAL, len(journal), complete=True)
     keys = [instance.key for instance in instances]
     identity, contexts = read_contexts(folder, keys, encoder or configuration.get("encoder"))
-    arrays = dense(folder, rows, keys, policies)
-    outcomes = LoggedOutcomes(folder, instances, tuple(policies), contexts, identity, **arrays, metadata=configuration | _told(changes), skills=None)
+
+    def with_chosen(came_to: Sequence[Outcome]) -> dict[str, Any]:
+        mine = [_row(decision, decision.policy, outcome) for decision, outcome in zip(decisions, came_to, strict=True)]
+        return dense(folder, [*rows, *mine], keys, policies)
+
+    told = configuration | _told(changes)
+    outcomes = LoggedOutcomes(folder, instances, tuple(policies), contexts, identity, **with_chosen(alone), metadata=told, skills=None)
+    received = outcomes if alone == own else replace(outcomes, **with_chosen(own))
     propensities = np.array([[decision.propensities.get(policy, 0.0) for policy in policies] for decision in decisions], np.float64)
     chosen = np.array([policies.index(decision.policy) for decision in decisions], np.int64)
     selector = str(configuration.get("selector", "unknown"))
-    return LiveLog(tuple(decisions), outcomes, chosen, propensities, selector, asdict(weights), changes)
+    return LiveLog(tuple(decisions), outcomes, chosen, propensities, selector, asdict(weights), received, changes)
 
 
 def _told(changes: Sequence[PolicyChange]) -> dict[str, Any]:

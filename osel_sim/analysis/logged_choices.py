@@ -31,4 +31,4 @@ def choices_of(log: LoggedOutcomes) -> LiveLog:
     policies = len(log.policies)
     propensities = np.repeat((1.0 - np.array(values, np.float64))[:, None] / max(policies - 1, 1), policies, axis=1)
     propensities[np.arange(len(log)), chosen] = values
-    return LiveLog((), log, chosen.astype(np.int64), propensities, "whoever chose", {})
+    return LiveLog((), log, chosen.astype(np.int64), propensities, "whoever chose", {}, log)

@@ -4,17 +4,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import altair as alt
 import numpy as np
 
 from osel_sim.analysis.estimate import Estimate
 from osel_sim.formats.moments_result import read_moments_result
-from osel_sim.reporting.charts import SHOWN, Figure, Look, Panel, listed, panel
+from osel_sim.reporting.charts import Figure, Look, Panel, listed
 from osel_sim.reporting.curves import Line, curves
 from osel_sim.reporting.dots import Dot, certain, scatter
 from osel_sim.reporting.html_tables import Cell, Column, Table
 from osel_sim.reporting.page import Block, Page, Section, Tile, Verdict
-from osel_sim.reporting.palette import LIGHT, colours
+from osel_sim.reporting.palette import colours
+from osel_sim.reporting.who_drove import Drive, parts_of, who_drove
 
 _TONES: dict[str, Literal["good", "neutral", "bad"]] = {"hand_over": "good", "do_not": "neutral", "unknown": "neutral"}
 FEWEST = 3
@@ -64,36 +64,20 @@ def _tiles(result: Mapping[str, Any]) -> list[Tile]:
 def _timeline(result: Mapping[str, Any]) -> Figure:
     """Who drove when, in some episodes."""
     verdict, episodes = result["verdict"], result["timeline"]
-    records = []
-    for number, one in enumerate(episodes):
+    drives = []
+    for one in episodes:
         ends = ["solved" if one[name] else "not solved" for name in ("success", "success_alone")]
         about = f"{one['instance']}: {ends[0]}; {one['first']} alone: {ends[1]}"
-        own = {"episode": number, "task": one["task"], "about": about, "end": one["steps"], "solved": "\u2713" if one["success"] else "\u2717"}
-        records.append(own | {"name": one["first"], "from": 0, "to": one["at"] or one["steps"], "last": one["second"] is None})
-        if one["second"]:
-            records.append(own | {"name": one["second"], "from": one["at"], "to": one["steps"], "last": True})
-    look = Look(colours(result["policies"]))
-    base = alt.Chart(alt.InlineData(values=records)).transform_filter(SHOWN)
-    y = alt.Y("episode:O", title=None, axis=alt.Axis(labels=False, ticks=False, domain=False, grid=False))
-    told = [alt.Tooltip("about:N", title="episode"), alt.Tooltip("name:N", title="drives"), alt.Tooltip("from:Q"), alt.Tooltip("to:Q")]
-    bars = base.mark_bar(height=7).encode(x=alt.X("from:Q", title="control step"), x2="to:Q", y=y, color=look.color(symbol="square"), tooltip=told)
-    marks = base.transform_filter("datum.last").mark_text(align="left", dx=4, fontSize=9, color=LIGHT["muted"]).encode(x="to:Q", y=y, text="solved:N")
-    words = (
-        base.transform_filter("datum.from == 0")
-        .mark_text(align="left", dx=3, fontSize=7, color=LIGHT["surface"])
-        .encode(x=alt.value(0), y=y, text="task:N")
-    )
+        handoffs = [(one["at"], one["second"])] if one["second"] else []
+        drives.append(Drive(one["task"], about, one["success"], parts_of(one["first"], handoffs, one["steps"])))
     handed = [one for one in episodes if one["second"]]
     saved, spoilt = (sum(one["success"] != one["success_alone"] and one["success"] == won for one in handed) for won in (True, False))
-    return Figure(
-        "timeline",
-        "Who drove",
+    caption = (
         f"{verdict['start']} at the start, {verdict['monitor'] or 'nobody'} as the monitor: {len(episodes)} episodes, a row each, by task. "
-        f"\u2713 solved, \u2717 not. {len(handed)} were handed over: {saved} of them were solved that the first policy alone would have lost, "
-        f"{spoilt} lost that it would have solved.",
-        f"Rows of {len(episodes)} episodes in the colours of who drove.",
-        [panel("", 9 * max(len(episodes), 1), bars, marks, words)],
+        f"{len(handed)} were handed over: {saved} of them were solved that the first policy alone would have lost, "
+        f"{spoilt} lost that it would have solved."
     )
+    return who_drove(drives, result["policies"], caption)
 
 
 def _gains(result: Mapping[str, Any]) -> list[Block]:

@@ -27,6 +27,7 @@ from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, note_o
 from osel_sim.reporting.html_tables import Cell, Column, Table, to_text
 from osel_sim.reporting.log_page import few, interval, log_sections, signed
 from osel_sim.reporting.log_sections import CREDIT, FALLBACKS, formula
+from osel_sim.reporting.monitor_section import monitor_sections
 from osel_sim.reporting.off_policy_section import off_policy_table
 from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
 from osel_sim.reporting.palette import colours
@@ -69,6 +70,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
     sections = [*warnings_section(folder), Section("curves", "Learning", blocks), *run_budget(folder, run.decisions)]
+    sections += monitor_sections(run.live, run.weights)
     try:
         sections += log_sections(run.log, run.weights)[0]
     except DataError as error:  # a run without counterfactual knows too little for some tables
@@ -123,14 +125,13 @@ def _streams(run: _Run, selector: str) -> dict[str, Stream]:
     """The selector, and where every policy ran in a decision what each would have received there, and the best of them."""
     rows, log = np.arange(len(run.chosen)), run.log
     rewards = log.mean_rewards(run.weights)
-    score = score_of(log, run.weights)[:, :, 0]
-    tables = np.stack([rewards, log.success[:, :, 0], score, score - rewards, log.seconds[:, :, 0], log.price[:, :, 0]])
+    tables = _tables(log, run.weights)
 
     def stream(received: Array, chosen: NDArray[np.int64] | None = None) -> Stream:
         reward, success, own, lost, seconds, price = received[:, None, :]
         return Stream(reward, success, own, lost, seconds, price, chosen)
 
-    streams = {selector: stream(tables[:, rows, run.chosen], run.chosen[None])}
+    streams = {selector: stream(_tables(run.live.received, run.weights)[:, rows, run.chosen], run.chosen[None])}
     complete = np.isfinite(rewards).all(axis=1)
     if complete.any() and len(log.policies) > 1:
         for column, policy in enumerate(log.policies):
@@ -138,6 +139,12 @@ def _streams(run: _Run, selector: str) -> dict[str, Stream]:
         best = np.where(complete, np.nan_to_num(rewards, nan=-np.inf).argmax(axis=1), 0)
         streams[HINDSIGHT] = stream(np.where(complete, tables[:, rows, best], np.nan))
     return streams
+
+
+def _tables(log: LoggedOutcomes, weights: RewardWeights) -> Array:
+    """(6, T, P): reward, success, what the reward credits, what it takes off for time and price, seconds, cents."""
+    rewards, score = log.mean_rewards(weights), score_of(log, weights)[:, :, 0]
+    return np.stack([rewards, log.success[:, :, 0], score, score - rewards, log.seconds[:, :, 0], log.price[:, :, 0]])
 
 
 def _look(run: _Run, streams: Mapping[str, Stream]) -> Look:
@@ -156,7 +163,7 @@ def _propensities(run: _Run) -> Figure:
 
 
 def _chosen_table(run: _Run, selector: str) -> Table:
-    log, rows = run.log, []
+    log, rows = run.live.received, []
     rewards = log.mean_rewards(run.weights)
     parts = [(selector, np.ones(len(run.chosen), bool)), *((f"chose {name}", run.chosen == column) for column, name in enumerate(log.policies))]
     for name, mine in parts:
@@ -262,4 +269,4 @@ def _episodes(run: _Run, scenes: Mapping[int, bytes], beside: Path) -> Episodes:
         file = run.folder / VIDEOS / f"{index:05d}-{decision.policy}.mp4"
         if file.is_file():
             videos[index, int(run.chosen[index])] = file
-    return list_episodes(run.log, run.weights, run.chosen, notes, scenes, videos, beside=beside)
+    return list_episodes(run.live.received, run.weights, run.chosen, notes, scenes, videos, beside=beside)
