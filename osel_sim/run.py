@@ -17,6 +17,7 @@ EXAMPLES = """examples:
   python -m osel_sim.run --task pick_place --episodes 60 --counterfactual  # PPO, compared with what could have been
   python -m osel_sim.run --task tag:short --level 0 2 --episodes 200       # several tasks and levels, mixed
   python -m osel_sim.run --task all --level 0 2 --selector auto --encoder osel_suite --warm-start assets/logs/suite   # it has seen a log's outcomes
+  python -m osel_sim.run --task pick_place open_drawer --selector auto --encoder auto --episodes 200   # the encoder that predicts rewards
   python -m osel_sim.run --task pick_place --selector epsilon_greedy --video 3 --out runs/first
   python -m osel_sim.run --task pick_place --selector auto --episodes 200 --budget-cents 500   # never spends more, and says what a dollar would buy
   python -m osel_sim.run --task open_drawer --policies local_small remote_specialist --monitor value   # and who drives on, within the episode
@@ -27,8 +28,8 @@ EXAMPLES = """examples:
 
 Writes into --out: run.json (everything it depends on), episodes.jsonl (the journal), timing.jsonl (what things really took), counterfactual.jsonl,
 points.jsonl (what a monitor saw), events.jsonl (policies that joined or left), contexts.npz, selector.safetensors, summary.json, curve.png,
-videos/, and report.html, the page about it, with figures/ and tables/ beside it; budget.json with --budget-cents, and warnings.jsonl where something
-changed that nobody announced.
+videos/, and report.html, the page about it, with figures/ and tables/ beside it; budget.json with --budget-cents, encoders.jsonl with --encoder auto
+(which encoder it went on with, since when and why), and warnings.jsonl where something changed that nobody announced.
 Decision t is made on the instance of seed 1,000,000 * --seed + t."""
 
 
@@ -43,6 +44,8 @@ def _execute(config: RunConfig) -> int:
         console().print(run_table(dict(result.summary)))
         if config.monitor and "monitor" in result.summary:
             console().print(plain(monitor_words(config.monitor, result.summary)), soft_wrap=True)
+        if "encoder" in result.summary:
+            console().print(plain(result.summary["encoder"]["text"]), soft_wrap=True)
         if result.verdict:
             console().print(plain(result.verdict, "bold"), soft_wrap=True)
         if result.spent:

@@ -20,9 +20,19 @@ def cross_fit(first: Rows, decide: Decide) -> NDArray[Any]:
         first: (N,) the instances of one half; neither none nor all.
         decide: called for the first half's sake, then for the second's.
     """
-    parts = [(on, decide(by, on)) for by, on in ((~first, first), (first, ~first))]
-    result = np.empty((len(first), *parts[0][1].shape[1:]), parts[0][1].dtype)
-    for on, values in parts:
+    return cross_fit_parts((~first).astype(np.int64), decide)
+
+
+def cross_fit_parts(parts: NDArray[np.int64], decide: Decide) -> NDArray[Any]:
+    """What all other parts of the instances say about each, (N, ...).
+
+    Args:
+        parts: (N,) number of the part that each instance is in; at least two.
+        decide: called for each part's sake, in the order of their numbers.
+    """
+    told = [(parts == part, decide(parts != part, parts == part)) for part in np.unique(parts)]
+    result = np.empty((len(parts), *told[0][1].shape[1:]), told[0][1].dtype)
+    for on, values in told:
         result[on] = values
     return result
 

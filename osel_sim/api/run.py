@@ -2,12 +2,13 @@
 
 import contextlib
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from osel_sim.api.declared import declared
 from osel_sim.api.interruption import Interrupt
 from osel_sim.api.results import RunResult
 from osel_sim.api.run_settings import RunConfig
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from osel_sim.episodes.live import LiveRun
     from osel_sim.episodes.run_subscribers import RunSubscriber
     from osel_sim.formats.policy_changes import PolicyChange
-    from osel_sim.formats.policy_file import PolicySpec
     from osel_sim.interface.encoder import Encoder
     from osel_sim.interface.monitor import MonitorFactory
     from osel_sim.interface.policy import Policy
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from osel_sim.policy.objects import PolicyObject
     from osel_sim.reporting.live_page import LivePage
     from osel_sim.selection.budget import Budgeted
-    from osel_sim.selection.reward import RewardWeights
 
     SelectorLike = str | SelectorFactory
     MonitorLike = str | MonitorFactory
@@ -106,6 +105,7 @@ class _Run:
         from osel_sim.api.robots import check_robots
         from osel_sim.api.run_budget import budget_of
         from osel_sim.api.run_changes import plan
+        from osel_sim.api.run_encoder import check_encoder
         from osel_sim.api.run_monitor import check_monitor
         from osel_sim.api.run_resume import policies_then
         from osel_sim.episodes.drivers import choose_policies, with_fallbacks
@@ -129,6 +129,7 @@ class _Run:
         self.budget = budget_of(config, self.tasks, [*self.policies, *self.plan.joined.values()])
         self.sharing = check_robots(config, self.tasks, self.factory is None, objects, watchers)
         check_monitor(config, monitor, self.policies)
+        check_encoder(config)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
         # Refuses an unknown level or axis before anything loads.
         drawn = (task.instance(0, level, config.split, self.axes) for task in self.tasks for level in config.level)
@@ -159,16 +160,15 @@ class _Run:
 
     def _run(self, folder: Path, configuration: dict[str, Any], holding: contextlib.ExitStack) -> RunResult:
         from osel_sim.api.robot_workers import made_by
+        from osel_sim.api.run_encoder import encoder_said, load_encoders
         from osel_sim.api.run_monitor import start_monitor_warm
-        from osel_sim.context.encoder import load_encoder
-        from osel_sim.context.names import DEFAULT_ENCODER
         from osel_sim.formats.journal import JOURNAL
         from osel_sim.formats.run_config import note_growth, start_or_resume
         from osel_sim.suites.ran_with import ran_with
 
         config = self.config
-        encoder = load_encoder(config.encoder or DEFAULT_ENCODER)
-        configuration["encoder"] = encoder.identity
+        encoder, *others = load_encoders(config)
+        configuration["encoder"] = encoder_said(config, encoder)
         seen = self._log(config.warm_start, encoder.identity) if config.warm_start else None
         machine = ran_with(self.tasks)
 
@@ -187,7 +187,7 @@ class _Run:
                 holding.enter_context(taken(folder, (JOURNAL,)))
             for warning in start_or_resume(folder, configuration, machine, config.resume, config.to_json()):
                 logger.warning(warning)
-            live = self._live(folder, encoder, drivers, selector)
+            live = self._live(folder, (encoder, *others), drivers, selector)
             stack.callback(live.close)
             if seen is not None:
                 self._start_warm(live, seen)
@@ -223,6 +223,7 @@ class _Run:
         """Everything the journal depends on but the encoder, content of files included."""
         from osel_sim.api.robots import fleet_said
         from osel_sim.api.run_budget import said
+        from osel_sim.api.run_encoder import encoders_said
         from osel_sim.api.run_monitor import monitor_said
         from osel_sim.core.files import digest
         from osel_sim.formats.rollout_log import ROLLOUTS
@@ -244,6 +245,7 @@ class _Run:
             "reward": asdict(self.weights),
             "counterfactual": config.counterfactual,
             **({"context": config.context} if config.context else {}),
+            **encoders_said(config),
             **said(self.budget),
             **fleet_said(config, self.sharing),
             **monitor_said(config),
@@ -263,19 +265,29 @@ class _Run:
 
     def _free_selector(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Selector":
         from osel_sim.api.robots import in_turn
+
+        return in_turn(self.config, self.sharing, self._maker(encoder, configuration))
+
+    def _maker(self, encoder: "Encoder", configuration: dict[str, Any]) -> "Callable[[int], Selector]":
+        """Makes the selector of a seed."""
         from osel_sim.context.appended import LENGTH
         from osel_sim.selection.registry import make_selector, wanted_of
 
         names = [spec.name for spec in self.policies]
         parts = (encoder.dimension, LENGTH) if self.config.context else (encoder.dimension,)
         if self.factory is not None:
-            return in_turn(self.config, self.sharing, partial(self.factory, names, sum(parts)))
-        known = _declared(self.config, self.tasks, self.policies, self.weights, encoder)
+            return partial(self.factory, names, sum(parts))
+        known = declared(self.config, self.tasks, self.policies, self.weights, encoder)
         if "skills" in known:
             configuration["skills"] = known["skills"].digest if known["skills"] is not None else None
         if len(parts) > 1:
             known |= wanted_of(self.config.selector, {"parts": parts})
-        return in_turn(self.config, self.sharing, partial(make_selector, self.config.selector, names, sum(parts), **known))
+        return partial(make_selector, self.config.selector, names, sum(parts), **known)
+
+    def _once_more(self, encoder: "Encoder", seed: int) -> "tuple[Selector, PolicyChanges]":
+        """A selector that takes over with another encoder, and the changes of policies as it is told of them."""
+        selector = self._maker(encoder, {})(seed)
+        return selector, self._changes(encoder, selector)
 
     def _changes(self, encoder: "Encoder", selector: "Selector") -> "PolicyChanges":
         """The changes of the run, with what the selector is told of policies when they join."""
@@ -288,7 +300,7 @@ class _Run:
 
         def told(change: "PolicyChange") -> dict[str, Any]:
             known = self.factory is None and change.event == "add"
-            return _declared(self.config, self.tasks, self.plan.known_at(change), self.weights, encoder) if known else {}
+            return declared(self.config, self.tasks, self.plan.known_at(change), self.weights, encoder) if known else {}
 
         return PolicyChanges(changes, tuple(map(told, changes)))
 
@@ -308,12 +320,13 @@ class _Run:
         log = read_log(folder, encoder).only([spec.name for spec in self.policies])
         return log.with_tasks() if self.config.context else log
 
-    def _live(self, folder: Path, encoder: "Encoder", drivers: Any, selector: "Selector") -> "LiveRun":
+    def _live(self, folder: Path, encoders: "tuple[Encoder, ...]", drivers: Any, selector: "Selector") -> "LiveRun":
+        from osel_sim.api.run_encoder import make_trial
         from osel_sim.api.run_monitor import make_run_monitor
         from osel_sim.episodes.live import LiveOptions, LiveRun
         from osel_sim.formats.merged_policy import MERGE
 
-        config = self.config
+        config, encoder = self.config, encoders[0]
         options = LiveOptions(
             *(config.seed, self.weights, tuple(config.level), config.split, config.counterfactual, self.axes, config.action_noise, config.context),
             changes=self._changes(encoder, selector),
@@ -321,6 +334,7 @@ class _Run:
             prices={spec.name: spec.price for spec in (*self.policies, *self.plan.joined.values()) if spec.kind != MERGE},
             robots=config.robots,
             robots_by=config.robots_by,
+            trial=make_trial(config, folder, encoders, self._once_more),
         )
         monitor = make_run_monitor(config, self.monitor, self.policies, encoder, self.weights)
         return LiveRun(folder, self.tasks, encoder, drivers, selector, options, self._subscribers(folder), monitor)
@@ -379,21 +393,3 @@ class _Run:
 def title(tasks: "Sequence[Task]") -> str:
     """What a run's tables and figures are headed."""
     return tasks[0].name if len(tasks) == 1 else f"{len(tasks)} tasks"
-
-
-def _declared(
-    config: RunConfig, tasks: "Sequence[Task]", policies: "Sequence[PolicySpec]", weights: "RewardWeights", encoder: "Encoder"
-) -> dict[str, Any]:
-    """Settings by which a selector is told what policies declare, as far as it wants to know: what they cost, and what they were made for."""
-    from osel_sim.episodes.declared_skills import declare
-    from osel_sim.episodes.expected_costs import expected_costs
-    from osel_sim.selection.registry import setting_names
-
-    wanted, known = setting_names(config.selector), dict[str, Any]()
-    if "expected_costs" in wanted:
-        # Half of the horizon is about what a success takes; how costs differ from task to task is learned.
-        actions = sum(task.info.horizon for task in tasks) // (2 * len(tasks))
-        known["expected_costs"] = expected_costs(policies, weights, max(1, actions), tasks[0].specification)
-    if "skills" in wanted:
-        known["skills"] = declare(policies, encoder, tasks, config.tasks)
-    return known

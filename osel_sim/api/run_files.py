@@ -31,6 +31,8 @@ def write_results(live: "LiveRun", title: str, selector: str) -> dict[str, Any]:
     known = [(reward, alone) for reward, alone in both if reward is not None and alone is not None]
     if known:
         summary["monitor"] |= {"compared_decisions": len(known), "with": mean([one for one, _ in known]), "without": mean([one for _, one in known])}
+    if (trial := live.options.trial) is not None:
+        summary["encoder"] = {"identity": live.encoder.identity, "text": trial.words}
     write_json(live.folder / SUMMARY, summary)
     within = live.selector.inner if isinstance(live.selector, Budgeted) else live.selector
     # A selector of one's own need only choose and learn; a resumed run learns from the journal anyway.

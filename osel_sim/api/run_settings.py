@@ -36,7 +36,8 @@ class RunConfig(RobotSettings, RewardSettings, InstanceSettings, ContentSettings
     episodes: Annotated[Count, MAIN] = 60
     """number of decisions"""
     encoder: Annotated[str | None, MAIN] = None
-    """osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, or a folder"""
+    """osel_small (default), osel_suite, MODEL:TAG of open_clip such as ViT-L-14:openai, MODEL:FILE, a folder, or auto: osel_small until the first
+    decisions say which of those at hand predicts rewards"""
     context: Annotated[Literal["task"] | None, OTHER] = None
     """append the task's name to the contexts; auto finds out whether it helps"""
     seed: Annotated[Index, MAIN] = 0

@@ -25,6 +25,7 @@ FORMS = {
     "FOLDER": "an open_clip folder, such as osel_sim.train --encoder writes",
     "sentence:MODEL": "a sentence-transformers model, which looks at no images (extra text)",
     "tfidf": "words of the log's own texts, for osel_sim.ingest only",
+    "auto": "whichever of those at hand predicts rewards, by the evidence (run, replay and ingest)",
 }
 """What else `--encoder` takes."""
 

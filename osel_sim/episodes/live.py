@@ -14,6 +14,7 @@ from osel_sim.context.cache import ContextCache
 from osel_sim.core.errors import DataError
 from osel_sim.episodes.changes import PolicyChanges
 from osel_sim.episodes.drivers import Drivers
+from osel_sim.episodes.encoder_trial import EncoderTrial, tell_again
 from osel_sim.episodes.loop import run_episode
 from osel_sim.episodes.played import Played
 from osel_sim.episodes.run_subscribers import RunSubscriber
@@ -64,6 +65,7 @@ class LiveOptions:
         robots_by: what their instances differ in (`osel_sim.selection.dealing`); None: nothing.
         changes: policies that join and leave.
         prices: what policies cost by their files, for warnings.
+        trial: finds out with which encoder to go on; None: with the one that it began with.
     """
 
     seed: int
@@ -78,6 +80,7 @@ class LiveOptions:
     robots_by: By | None = None
     changes: PolicyChanges = field(default_factory=PolicyChanges)
     prices: Mapping[str, Price] = field(default_factory=dict)
+    trial: EncoderTrial | None = None
 
 
 class LiveRun:
@@ -128,7 +131,7 @@ class LiveRun:
         self._others = Lines(folder / COUNTERFACTUAL, keep=len(self.decisions)) if options.counterfactual else None
         self.warnings: list[RunWarning] = []
         self._watch = Watch(options.prices, [(task.name, level) for task in tasks for level in options.levels])
-        self._ever = tuple(selector.policies)
+        self._ever, self._changes = tuple(selector.policies), options.changes
         self._rows: list[dict[str, float | None]] = []
         self.alone: list[float | None] = []
         self._horizons = {task.name: max(1, task.info.horizon) for task in tasks}
@@ -191,6 +194,7 @@ class LiveRun:
                 known |= others.rewards
                 self.alone += [others.alone_reward] if others.alone is not None else []
             self._rows.append(known)
+            self._choose_encoder(decision.index + 1)
         self._change(len(self.decisions))
 
     def decide(self) -> Decision:
@@ -248,6 +252,7 @@ class LiveRun:
             self.warnings.append(warning)
             for subscriber in self.subscribers:
                 subscriber.on_warning(warning)
+        self._choose_encoder(decision.index + 1)
         if self._change(decision.index + 1):
             self._tell_changes(decision.index + 1)
 
@@ -309,17 +314,36 @@ class LiveRun:
         return others
 
     def _context(self, instance: Instance, loaded: bool) -> NDArray[np.float32]:
+        for encoder in self.options.trial.tried if self.options.trial is not None else ():
+            self._encoded(encoder, instance, loaded)
+        return self._shown(instance, loaded)
+
+    def _shown(self, instance: Instance, loaded: bool = False) -> NDArray[np.float32]:
+        return self.shown(self._encoded(self.encoder, instance, loaded), instance)
+
+    def shown(self, context: NDArray[np.float32], instance: Instance) -> NDArray[np.float32]:
+        """The encoder's context of an instance as the selector is shown it."""
+        return np.concatenate([context, name_part(instance.task)]) if self.options.context else context
+
+    def _encoded(self, encoder: Encoder, instance: Instance, loaded: bool = False) -> NDArray[np.float32]:
         def images() -> list[NDArray[np.uint8]]:
             env = self.envs[instance.task]
             if not loaded:
                 env.load(instance)
-            return view(env, self.encoder)
+            return view(env, encoder)
 
-        return self.shown(self.cache.encode(self.encoder, instance.key, images, instance.instruction), instance)
+        return self.cache.encode(encoder, instance.key, images, instance.instruction)
 
-    def shown(self, context: NDArray[np.float32], instance: Instance) -> NDArray[np.float32]:
-        """What the selector is shown of an instance, of the encoder's context of it."""
-        return np.concatenate([context, name_part(instance.task)]) if self.options.context else context
+    def _choose_encoder(self, count: int) -> None:
+        """Go on with the encoder that the first so many decisions speak for, where it is to be asked after them."""
+        if (trial := self.options.trial) is None or not trial.due(count):
+            return
+        decisions, instances = self.decisions[:count], [self.instance(index) for index in range(count)]
+        found = trial.ask(decisions, self.selector.policies, lambda encoder: np.stack([self._encoded(encoder, item) for item in instances]))
+        if found is not self.encoder:
+            self.encoder = found
+            self.selector, self._changes = trial.make(found)
+            tell_again(self.selector, self._changes, decisions, [self._shown(item) for item in instances], self._learn)
 
     def reward(self, outcome: Outcome) -> float | None:
         """What the selector learns of an outcome; None of an error."""
@@ -333,12 +357,12 @@ class LiveRun:
 
     def _change(self, index: int) -> bool:
         """Let policies join and leave before a decision. Returns whether any does."""
-        changed = self.options.changes.apply(self.selector, index)
+        changed = self._changes.apply(self.selector, index)
         self._ever = tuple(dict.fromkeys([*self._ever, *(change.policy for change in changed)]))
         return bool(changed)
 
     def _tell_changes(self, index: int) -> None:
-        for change in self.options.changes.made:
+        for change in self._changes.made:
             for subscriber in self.subscribers if change.before == index else ():
                 subscriber.on_event(change)
 

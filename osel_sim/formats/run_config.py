@@ -25,7 +25,7 @@ from osel_sim.interface.suite import Task
 
 SCHEMA_VERSION = 1
 RUN = "run.json"
-UNSAID = ("robot", "context", "until_decided", "monitor", "moments", "budget", "fleet", "shard")
+UNSAID = ("robot", "context", "encoders", "until_decided", "monitor", "moments", "budget", "fleet", "shard")
 """Keys of a configuration that are left out where they say what is usual; they are compared all the same."""
 LIBRARIES = ("gymnasium", "lerobot", "mujoco", "numba", "numpy", "open_clip_torch", "osel-sim", "robosuite", "stable_baselines3", "torch")
 

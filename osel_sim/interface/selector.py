@@ -82,6 +82,20 @@ class Pays(Protocol):
 
 
 @runtime_checkable
+class Recalls(Protocol):
+    """A selector that must be told of a choice that it did not make itself before `update`. Optional: a stranger's selector need not be one."""
+
+    def recall(self, context: Context, policy: str, propensities: Mapping[str, float]) -> Choice:
+        """The choice as if it had made it just now, to be passed to `update` next.
+
+        Args:
+            policy: that was chosen.
+            propensities: with which it was.
+        """
+        ...
+
+
+@runtime_checkable
 class Shares(Protocol):
     """A selector that learns together with others of its kind, policies and settings, on other robots: they exchange what they learned, never images.
 

@@ -23,6 +23,7 @@ from osel_sim.reporting.budget_section import run_budget
 from osel_sim.reporting.changes_section import changes_table
 from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, thinned
+from osel_sim.reporting.encoder_section import encoder_section
 from osel_sim.reporting.episodes import Scenes, list_episodes, no_scenes, note_of
 from osel_sim.reporting.html_tables import Cell, Column, Table, to_text
 from osel_sim.reporting.log_page import few, interval, log_sections, signed
@@ -69,7 +70,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     blocks += [_propensities(run), _chosen_table(run, selector), *([changes_table(run.live, run.weights)] if run.live.changes else [])]
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
-    sections = [*warnings_section(folder), Section("curves", "Learning", blocks), *run_budget(folder, run.decisions)]
+    sections = [*warnings_section(folder), Section("curves", "Learning", blocks), *encoder_section(folder), *run_budget(folder, run.decisions)]
     sections += monitor_sections(run.live, run.weights)
     try:
         sections += log_sections(run.log, run.weights)[0]

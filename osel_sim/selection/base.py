@@ -81,6 +81,22 @@ class SelectorBase(ABC):
             raise UsageError(f"a reward must be finite, got {reward}; an episode that ended in error has none")
         self._update(context, choice, float(reward))
 
+    def recall(self, context: Context, policy: str, propensities: Mapping[str, float]) -> Choice:
+        """A choice that somebody else made, to be passed to `update` next: the selector counts it as one of its own.
+
+        Args:
+            policy: that was chosen.
+            propensities: with which it was.
+
+        Raises:
+            UsageError: a context of the wrong form.
+            UnknownNameError: it does not have the policy.
+        """
+        self._check_context(context)
+        if policy not in self.policies:
+            raise UnknownNameError("policy", policy, self.policies, "the policies of this selector")
+        return self._recall(context, Choice(policy, dict(propensities)))
+
     def expected(self, context: Context) -> NDArray[np.float64] | None:
         """Expected reward of each policy for a context, (P,), up to a constant that all have; None of a selector that has none, and heeds no charges.
 
@@ -162,6 +178,10 @@ class SelectorBase(ABC):
 
     @abstractmethod
     def _select(self, context: Context) -> Choice: ...
+
+    def _recall(self, context: Context, choice: Choice) -> Choice:
+        """What `_select` notes besides choosing; returns the choice with the details that `_update` wants."""
+        return choice
 
     @abstractmethod
     def _update(self, context: Context, choice: Choice, reward: float) -> None: ...

@@ -60,6 +60,10 @@ class EpsilonGreedySelector(SharedMeans, SelectorBase):
         self._decisions += 1
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
+    def _recall(self, context: Context, choice: Choice) -> Choice:
+        self._decisions += 1
+        return choice
+
     def _expected(self, context: Context) -> NDArray[np.float64]:
         return self._means.copy()
 

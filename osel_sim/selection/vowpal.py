@@ -57,6 +57,10 @@ class VowpalSelector(SelectorBase):
         index = self._generator.choice(len(self.policies), p=propensities)
         return Choice(self.policies[index], dict(zip(self.policies, propensities.tolist(), strict=True)))
 
+    def _recall(self, context: Context, choice: Choice) -> Choice:
+        self._scale.add(context)
+        return choice
+
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         label = f"0:{-reward!r}:{choice.propensities[choice.policy]!r} "
         self._workspace.learn(self._example(context, self.known.index(choice.policy), label))

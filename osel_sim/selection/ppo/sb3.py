@@ -182,6 +182,17 @@ class PPOSelector(SelectorBase):
         propensities = dict(zip(self.policies, (probabilities / probabilities.sum()).tolist(), strict=True))
         return Choice(self.policies[int(action)], propensities, {"value": value.item(), "log_probability": log_probability.item()})
 
+    def _recall(self, context: Context, choice: Choice) -> Choice:
+        """With this network's value and log probability, so that it is trained on as an own decision: with the other selector's probability PPO would
+        stop at once where the two differ by more than `target_kl`."""
+        import torch
+
+        self._input.numpy()[0] = context
+        with self._random.in_use(), torch.no_grad():
+            action = torch.tensor([self.policies.index(choice.policy)])
+            value, log_probability, _ = self._algorithm.policy.evaluate_actions(self._input, action)
+        return Choice(choice.policy, choice.propensities, {"value": value.item(), "log_probability": log_probability.item()})
+
     def _update(self, context: Context, choice: Choice, reward: float) -> None:
         import torch
 

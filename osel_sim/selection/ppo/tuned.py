@@ -96,6 +96,10 @@ class TunedPPOSelector(PPOSelector):
         if fitted is not None:
             self._scale.load({**fitted, SEEN: self._scale.state()[SEEN]})
 
+    def _recall(self, context: Context, choice: Choice) -> Choice:
+        self._scale.add(context)
+        return super()._recall(self._scale.transform(context), choice)
+
     def _select(self, context: Context) -> Choice:
         self._scale.add(context)
         return super()._select(self._scale.transform(context))
