@@ -11,6 +11,8 @@ import pytest
 from run_helpers import wait_for_lines
 
 import osel_sim as osel
+from osel_sim.analysis.live import read_live
+from osel_sim.analysis.live_sharing import fleet_of, played_again
 from osel_sim.core.errors import SettingError, UsageError
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.formats.counterfactual import COUNTERFACTUAL
@@ -18,6 +20,7 @@ from osel_sim.formats.journal import JOURNAL, TIMING, read_lines
 from osel_sim.interface.selector import Choice
 from osel_sim.selection.fleet import Fleet, Sharing
 from osel_sim.selection.registry import make_selector
+from osel_sim.selection.reward import RewardWeights
 from osel_sim.selection.state import load_state
 
 TOY = Path(__file__).parent / "toy_suite"
@@ -80,6 +83,19 @@ def test_a_run_of_several_robots_is_the_same_bytes_for_any_number_of_workers(toy
     for timing, _ in read_lines(tmp_path / str(workers) / TIMING):
         assert set(timing["episodes"]) == {"toy_greedy", "toy_reader"}
         assert timing["seconds"] >= timing["context_and_choice"] + timing["episodes"]["toy_greedy"]["seconds"] > 0
+
+
+@pytest.mark.parametrize(("share", "delay"), [("every:2", 1), ("none", 0), ("all", 0)])
+def test_what_is_played_again_in_the_runs_own_order_is_what_the_run_did(toy, tmp_path, monkeypatch, share, delay):
+    settings = {**toy, "selector": "thompson", "robots": 3, "share": share, "share_delay": delay, "episodes": 18}
+    result = osel.run(out=tmp_path / "run", **settings)
+    monkeypatch.setattr("osel_sim.analysis.live_sharing.ORDERS", 1)
+    live = read_live(tmp_path / "run")
+    found = played_again(live, fleet_of(live), RewardWeights(**live.reward), budget=1_000)
+    received = np.array([decision.reward for decision in result.decisions]).reshape(-1, 3).mean(axis=1)
+    [entry] = found["selectors"].values()
+    assert found["orders"] == 1
+    assert np.allclose(entry["ways"][share]["curve"], received.cumsum() / np.arange(1, 7), atol=1e-12)
 
 
 def test_a_killed_run_of_workers_comes_back_to_the_same_bytes(toy, site, tmp_path):
