@@ -85,17 +85,15 @@ def test_a_run_of_several_robots_is_the_same_bytes_for_any_number_of_workers(toy
         assert timing["seconds"] >= timing["context_and_choice"] + timing["episodes"]["toy_greedy"]["seconds"] > 0
 
 
-@pytest.mark.parametrize(("share", "delay"), [("every:2", 1), ("none", 0), ("all", 0)])
-def test_what_is_played_again_in_the_runs_own_order_is_what_the_run_did(toy, tmp_path, monkeypatch, share, delay):
-    settings = {**toy, "selector": "thompson", "robots": 3, "share": share, "share_delay": delay, "episodes": 18}
-    result = osel.run(out=tmp_path / "run", **settings)
+def test_what_is_played_again_in_the_runs_own_order_is_what_the_run_did(toy, tmp_path, monkeypatch):
+    osel.run(out=tmp_path / "run", **toy, selector="thompson", robots=3, share="every:2", share_delay=1, episodes=18)
     monkeypatch.setattr("osel_sim.analysis.live_sharing.ORDERS", 1)
     live = read_live(tmp_path / "run")
     found = played_again(live, fleet_of(live), RewardWeights(**live.reward), budget=1_000)
-    received = np.array([decision.reward for decision in result.decisions]).reshape(-1, 3).mean(axis=1)
+    received = np.array([decision.reward for decision in live.decisions]).reshape(-1, 3).mean(axis=1)
     [entry] = found["selectors"].values()
     assert found["orders"] == 1
-    assert np.allclose(entry["ways"][share]["curve"], received.cumsum() / np.arange(1, 7), atol=1e-12)
+    assert np.allclose(entry["ways"]["every:2"]["curve"], received.cumsum() / np.arange(1, 7), atol=1e-12)
 
 
 def test_a_killed_run_of_workers_comes_back_to_the_same_bytes(toy, site, tmp_path):

@@ -51,14 +51,20 @@ def fleet_of(live: LiveLog) -> RunFleet | None:
     if not isinstance(said, Mapping):
         raise DataError(f"{where} is {said!r}, not a table")
     count, share, delay, by = (said.get(name) for name in ("robots", "share", "delay", "by"))
-    right = {"robots": type(count) is int and count >= 2, "share": isinstance(share, str), "delay": type(delay) is int and delay >= 0}
-    right["by"] = by in (None, "task", "level", "robot")
-    for name in (name for name, fine in right.items() if not fine):
-        raise DataError(f"{where}: {name} is {said.get(name)!r}, which no run writes")
-    try:
-        return RunFleet(count, Sharing.parse(share, delay), by)
-    except OselError as error:
-        raise DataError(f"{where}: {error}") from None
+    if type(count) is not int or count < 2:
+        wrong = "robots"
+    elif not isinstance(share, str):
+        wrong = "share"
+    elif type(delay) is not int or delay < 0:
+        wrong = "delay"
+    elif by not in (None, "task", "level", "robot"):
+        wrong = "by"
+    else:
+        try:
+            return RunFleet(count, Sharing.parse(share, delay), by)
+        except OselError as error:
+            raise DataError(f"{where}: {error}") from None
+    raise DataError(f"{where}: {wrong} is {said.get(wrong)!r}, which no run writes")
 
 
 def played_again(live: LiveLog, fleet: RunFleet, weights: RewardWeights, budget: int) -> dict[str, Any] | str:
@@ -99,4 +105,4 @@ def mean_so_far(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mean of what is not NaN up to each place; NaN before the first."""
     known = np.isfinite(values)
     total, number = np.where(known, values, 0.0).cumsum(), known.cumsum()
-    return np.divide(total, number, out=np.full(len(values), np.nan), where=number > 0)
+    return np.where(number > 0, total / np.maximum(number, 1), np.nan)
