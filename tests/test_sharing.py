@@ -75,8 +75,8 @@ def test_ppo_averages_its_weights(name: str) -> None:
             choice = fleet.select(robot, contexts[step, robot])
             fleet.update(robot, contexts[step, robot], choice, float(rewards[step, robot, POLICIES.index(choice.policy)]))
         if step == 19:
-            for robot, context, choice, reward in fleet._decided:
-                fleet.selectors[robot].update(context, choice, reward)
+            for robot, decided in fleet._decided.items():
+                fleet.selectors[robot].update(*decided)
             fleet._decided.clear()
             alone = [selector.share() for selector in fleet.selectors]
         fleet.end_round()

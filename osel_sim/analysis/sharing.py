@@ -51,6 +51,20 @@ class Robots:
 
 
 @dataclass(frozen=True)
+class Dealt:
+    """What is replayed to the robots.
+
+    Attributes:
+        seeds: of the streams, and of the selectors.
+        owners: (N,) robot of every instance of the log; None: instances are dealt out in turn.
+    """
+
+    streams: Streams
+    seeds: tuple[int, ...]
+    owners: NDArray[np.int64] | None = None
+
+
+@dataclass(frozen=True)
 class _Material:
     """What workers need: as `osel_sim.analysis.engine` has it, and the places of each seed's stream at which each robot decides, (rounds, robots)."""
 
@@ -94,17 +108,31 @@ def share_log(
     Raises:
         UsageError: too few tasks, levels or arms for so many robots, or streams too short.
     """
-    rewards = log.rewards(setup.weights)
-    streams = draw_streams(rewards, seeds, robots.decisions)
     owners = None
     if robots.by is not None:
         values = [getattr(instance, robots.by) for instance in log.instances]
         owner = groups(values, robots.count, robots.by)
         owners = np.array([owner[value] for value in values], np.int64)
-    places = [deal(owners, order, robots.count) for order in streams.order]
+    streams = draw_streams(log.rewards(setup.weights), seeds, robots.decisions)
+    return share_streams(log, setup, selectors, robots, Dealt(streams, tuple(seeds), owners), workers, count, factories)
+
+
+def share_streams(
+    log: LoggedOutcomes,
+    setup: Setup,
+    selectors: Sequence[str],
+    robots: Robots,
+    dealt: Dealt,
+    workers: int = 1,
+    count: Callable[[int], Any] = lambda decisions: None,
+    factories: Mapping[str, SelectorFactory] | None = None,
+) -> dict[str, Any]:
+    """The same with streams that were drawn already; arguments, result and errors are those of `share_log`."""
+    streams, seeds = dealt.streams, dealt.seeds
+    places = [deal(dealt.owners, order, robots.count) for order in streams.order]
     rounds = min(map(len, places))
     cut = tuple(own[:rounds] for own in places)
-    material = _Material(log.contexts, rewards, log.policies, streams, tuple(seeds), cut, setup, robots, factories or {})
+    material = _Material(log.contexts, log.rewards(setup.weights), log.policies, streams, seeds, cut, setup, robots, factories or {})
     jobs = [(name, way, seed) for name in selectors for way in robots.ways for seed in range(len(seeds))]
     found: dict[_Job, _Played] = {}
     with closing(played(partial(_play, material), jobs, workers)) as results:

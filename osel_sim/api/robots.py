@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from osel_sim.analysis.sharing import Robots
     from osel_sim.api.replay_settings import ReplayConfig
     from osel_sim.api.run_settings import RunConfig
+    from osel_sim.episodes.run_subscribers import RunSubscriber
     from osel_sim.interface.selector import Selector, SelectorFactory
     from osel_sim.interface.suite import Task
     from osel_sim.selection.fleet import Sharing
@@ -39,18 +40,24 @@ def sharing_asked(config: RobotSettings) -> "Sharing | None":
     return Sharing.parse(config.share or SHARE, config.share_delay)
 
 
-def check_robots(config: "RunConfig", tasks: "Sequence[Task]", named: bool) -> "Sharing | None":
+def check_robots(
+    config: "RunConfig", tasks: "Sequence[Task]", named: bool, objects: Collection[str] = (), watchers: "Sequence[RunSubscriber]" = ()
+) -> "Sharing | None":
     """What the robots of a live run share; None where there is but one.
 
     Args:
         named: whether the selector is one of the registry's.
+        objects: names of policies that are objects of this process.
+        watchers: subscribers of the caller's own.
 
     Raises:
-        UsageError: as `sharing_asked`; the selector cannot share; or there are fewer tasks, levels or arms than robots.
+        UsageError: as `sharing_asked`; the selector cannot share; there are fewer tasks, levels or arms than robots; or as `check_workers`.
     """
+    from osel_sim.api.robot_workers import check_workers
     from osel_sim.selection.dealing import robots_share
     from osel_sim.selection.registry import check_can_share
 
+    check_workers(config, objects, watchers)
     sharing = sharing_asked(config)
     if sharing is not None:
         if named and sharing.every is not None:

@@ -127,7 +127,7 @@ class _Run:
         self.weights = weights_of(config)[0]
         self._check_selector()
         self.budget = budget_of(config, self.tasks, [*self.policies, *self.plan.joined.values()])
-        self.sharing = check_robots(config, self.tasks, named=self.factory is None)
+        self.sharing = check_robots(config, self.tasks, self.factory is None, objects, watchers)
         check_monitor(config, monitor, self.policies)
         check_encoder(config)
         self.axes = parse_axes(config.axis, known_axes(self.tasks))
@@ -159,6 +159,7 @@ class _Run:
             return self._run(folder, configuration, holding)
 
     def _run(self, folder: Path, configuration: dict[str, Any], holding: contextlib.ExitStack) -> RunResult:
+        from osel_sim.api.robot_workers import made_by
         from osel_sim.api.run_encoder import encoder_said, load_encoders
         from osel_sim.api.run_monitor import start_monitor_warm
         from osel_sim.formats.journal import JOURNAL
@@ -180,7 +181,7 @@ class _Run:
             stack.enter_context(threads(1))
             selector = self._selector(encoder, configuration)
             logger.info("%s: loading %s, starting servers ...", title(self.tasks), ", ".join(spec.name for spec in self.driving))
-            drivers = stack.enter_context(Drivers(self.driving, self.environment, self.objects))
+            drivers = stack.enter_context(Drivers(self.driving if config.workers == 1 else (), self.environment, self.objects))
             # Only now, when all that could be missing is there, is the folder taken into use, and given back where not even one decision comes of it.
             if not config.resume:
                 holding.enter_context(taken(folder, (JOURNAL,)))
@@ -195,8 +196,9 @@ class _Run:
             self._write_changes(folder)
             if self.grown_from is not None:
                 note_growth(folder, config.episodes)
+            made = made_by(config, self.tasks, self.driving, live.subscribers)
             with Interrupt() as interrupt:
-                live.run(config.episodes, lambda: interrupt.asked or (self.spending is not None and not self.spending.affordable))
+                live.run(config.episodes, lambda: interrupt.asked or (self.spending is not None and not self.spending.affordable), made)
             interrupted = interrupt.asked and len(live.decisions) < config.episodes
         return self._finish(live, interrupted)
 

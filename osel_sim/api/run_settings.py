@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from osel_sim.api.robot_settings import RobotSettings
+from osel_sim.api.robot_settings import ROBOTS, RobotSettings
 from osel_sim.api.settings import (
     MAIN,
     OTHER,
@@ -46,6 +46,8 @@ class RunConfig(RobotSettings, RewardSettings, InstanceSettings, ContentSettings
     """where to write (default: runs/TASK-SELECTOR-sSEED)"""
     resume: Annotated[bool, MAIN] = False
     """go on with the run in --out; alone with the settings that it began with, and with --episodes to more decisions than it was to have"""
+    workers: Annotated[Count, ROBOTS] = 1
+    """processes that the episodes of several robots run in, with the same results for any number; each loads all policies"""
     add_policies: Annotated[Names, MAIN] = ()
     """with --resume: policies that join the run where it goes on; what the selector learned of the others stays"""
     retire: Annotated[Names, MAIN] = ()

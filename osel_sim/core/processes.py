@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection, wait
@@ -80,11 +81,10 @@ def run_jobs[J, R](
         Exception: `setup` raised it before any worker was ready.
         WorkerError: three jobs in a row lost a result, or no worker starts.
     """
-    pool = _Pool[J, R](cloudpickle.dumps(setup), [_Task(job, results(job)) for job in jobs], workers, ready)
-    try:
+    with closing(Pool[J, R](setup, min(workers, len(jobs)), ready)) as pool:
+        for job in jobs:
+            pool.add(job, results(job))
         yield from pool.work()
-    finally:
-        pool.close()
 
 
 @dataclass
@@ -150,17 +150,30 @@ class _Worker:
         return f"signal {-code}" if code < 0 else f"exit code {code}"
 
 
-class _Pool[J, R]:
-    def __init__(self, setup: bytes, tasks: Sequence[_Task[J]], workers: int, ready: Callable[[], None]) -> None:
+class Pool[J, R]:
+    """Worker processes for jobs of which not all are known beforehand; `run_jobs` says the rest. Close it to end them.
+
+    Args:
+        setup, ready: as `run_jobs` has them.
+        workers: at most so many processes.
+    """
+
+    def __init__(self, setup: Setup[J, R], workers: int, ready: Callable[[], None] = lambda: None) -> None:
         self._ready = ready
-        self._setup, self._todo, self._unfinished = setup, deque(tasks), len(tasks)
-        self._workers = [_Worker() for _ in range(min(workers, len(tasks)))]
+        self._setup, self._todo, self._unfinished = cloudpickle.dumps(setup), deque[_Task[J]](), 0
+        self._workers = [_Worker() for _ in range(workers)]
         self._begun = False  # some worker was ready once
         self._losses = 0
 
+    def add(self, job: J, results: int = 1) -> None:
+        """Put a job at the end of those that wait for `work`."""
+        self._todo.append(_Task(job, results))
+        self._unfinished += 1
+
     def work(self) -> Iterator[Result[J, R] | Lost[J]]:
-        self._staff()
+        """Work on all jobs, those too that are added after a result; yields and raises as `run_jobs` does."""
         while self._unfinished:
+            self._staff()
             listening = [worker for worker in self._workers if worker.connection is not None]
             ready = wait([worker.connection for worker in listening if worker.connection is not None])
             for worker in listening:
@@ -168,6 +181,7 @@ class _Pool[J, R]:
                     yield from self._heed(worker, worker.connection)
 
     def close(self) -> None:
+        """End all workers."""
         for worker in self._workers:
             worker.stop()
 

@@ -16,6 +16,7 @@ from osel_sim.episodes.changes import PolicyChanges
 from osel_sim.episodes.drivers import Drivers
 from osel_sim.episodes.encoder_trial import EncoderTrial, tell_again
 from osel_sim.episodes.loop import run_episode
+from osel_sim.episodes.played import Played
 from osel_sim.episodes.run_subscribers import RunSubscriber
 from osel_sim.episodes.start import Start
 from osel_sim.episodes.view import view
@@ -148,11 +149,12 @@ class LiveRun:
         table = [[float("nan") if (value := row.get(policy)) is None else value for policy in self._ever] for row in self._rows]
         return np.array(table, np.float64).reshape(-1, len(self._ever))
 
-    def run(self, decisions: int, stop: Callable[[], bool] = lambda: False) -> None:
+    def run(self, decisions: int, stop: Callable[[], bool] = lambda: False, make: "MakeDecisions | None" = None) -> None:
         """Make decisions until there are so many, or `stop` says so. The run is closed then; its subscribers are told of all of it.
 
         Args:
             stop: asked before each decision.
+            make: makes them; None: `one_after_another`.
         """
         with contextlib.ExitStack() as stack:
             for subscriber in self.subscribers:
@@ -161,8 +163,7 @@ class LiveRun:
                 for subscriber in self.subscribers:
                     subscriber.on_start(self)
                 self._tell_changes(len(self.decisions))
-                while len(self.decisions) < decisions and not stop():
-                    self.decide()
+                (make or one_after_another)(self, decisions, stop)
             for subscriber in self.subscribers:
                 subscriber.on_end(self)
 
@@ -174,7 +175,7 @@ class LiveRun:
         """
         for decision in self.decisions:
             self._change(decision.index)
-            instance = self._instance(decision.index)
+            instance = self.instance(decision.index)
             self._check(decision, instance)
             context = self._context(instance, loaded=False)
             choice = self.selector.select(context)
@@ -201,24 +202,33 @@ class LiveRun:
         index = len(self.decisions)
         for subscriber in self.subscribers:
             subscriber.on_instance(index)
-        instance = self._instance(index)
+        instance = self.instance(index)
         start = Start(self.envs[instance.task], instance)
         context = self._context(instance, loaded=True)
         choice = self.selector.select(context)
         for subscriber in self.subscribers:
             subscriber.on_choice(index, choice.policy)
         self.drivers.trust(choice.propensities)
-        outcome = self._episode(index, instance, start, choice.policy, chosen=True)
-        decision = self._decision(index, instance, choice, outcome, start.scene if self._tells_scenes else None)
-        # What a suite or a selector of others got wrong is told now, not when the journal is read.
-        to_decision(as_read(decision.to_dict(), f"{self._journal.file}, line {index + 1}"), index, self._journal.file)
-        rewards, checksums = {choice.policy: decision.reward}, {JOURNAL: line_digest(decision.to_dict())}
+        outcome, others, alone = self._episode(index, instance, start, choice.policy, chosen=True), dict[str, Outcome](), None
         if self._others is not None:
             rest = [policy for policy in self.selector.policies if policy != choice.policy]
-            found = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in rest}
-            others = Others(
-                index, found, {policy: self._reward(other) for policy, other in found.items()}, *self._alone(index, instance, start, choice)
-            )
+            others = {policy: self._episode(index, instance, start, policy, chosen=False) for policy in rest}
+            if self.monitor is not None:
+                alone = self._episode(index, instance, start, choice.policy, chosen=False)
+        decision = self.write(instance, choice, Played(outcome, start.scene, others, alone))
+        self._learn(context, choice, decision)
+        self.look_back(decision)
+        return decision
+
+    def write(self, instance: Instance, choice: Choice, played: Played) -> Decision:
+        """Write the next decision down, with what came of it."""
+        index, place = len(self.decisions), f"{self._journal.file}, line {len(self.decisions) + 1}"
+        decision = self._decision(index, instance, choice, played.outcome, played.scene if self._tells_scenes else None)
+        # What a suite or a selector of others got wrong is told now, not when the journal is read.
+        to_decision(as_read(decision.to_dict(), place), index, self._journal.file)
+        rewards, checksums = {choice.policy: decision.reward}, {JOURNAL: line_digest(decision.to_dict())}
+        if self._others is not None:
+            others = Others(index, played.others, {policy: self.reward(other) for policy, other in played.others.items()}, *self._alone(played))
             rewards |= others.rewards
             self._checked_others(as_read(others.to_dict(), f"{self._others.file}, line {index + 1}"), index, choice.policy)
             self._others.append(others.to_dict())
@@ -232,21 +242,23 @@ class LiveRun:
         self._journal.append(decision.to_dict())
         self.decisions.append(decision)
         self._rows.append(rewards)
-        self._learn(context, choice, decision)
+        return decision
+
+    def look_back(self, decision: Decision) -> None:
+        """What follows a decision that the selector has learned from."""
         if self.monitor is not None:
             self.monitor.learn(decision)
         for warning in self._watch.see(decision):
             self.warnings.append(warning)
             for subscriber in self.subscribers:
                 subscriber.on_warning(warning)
-        self._choose_encoder(index + 1)
-        if self._change(index + 1):
-            self._tell_changes(index + 1)
-        return decision
+        self._choose_encoder(decision.index + 1)
+        if self._change(decision.index + 1):
+            self._tell_changes(decision.index + 1)
 
     def instance_keys(self, count: int) -> frozenset[str]:
         """Keys of the instances of the first `count` decisions."""
-        return frozenset(self._instance(index).key for index in range(count))
+        return frozenset(self.instance(index).key for index in range(count))
 
     def close(self) -> None:
         """Close the files and the environments, and write the contexts. May be called twice."""
@@ -267,15 +279,15 @@ class LiveRun:
             watching.append(self.monitor.watch())
         return run_episode(env, instance, self.drivers[policy], fallback, watching, action_noise=self.options.action_noise, handoffs=handoffs)
 
-    def _alone(self, index: int, instance: Instance, start: Start, choice: Choice) -> tuple[Outcome, float | None] | tuple[()]:
+    def _alone(self, played: Played) -> tuple[Outcome, float | None] | tuple[()]:
         """What the chosen policy comes to without the monitor, with its reward; nothing where there is none."""
-        if self.monitor is None:
+        if played.alone is None:
             return ()
-        outcome = self._episode(index, instance, start, choice.policy, chosen=False)
-        self.alone.append(self._reward(outcome))
-        return outcome, self.alone[-1]
+        self.alone.append(self.reward(played.alone))
+        return played.alone, self.alone[-1]
 
-    def _instance(self, index: int) -> Instance:
+    def instance(self, index: int) -> Instance:
+        """What a decision is about."""
         options = self.options
         chance = np.random.default_rng([options.seed, index])
         tasks, levels = robots_share(self.tasks, options.levels, index % options.robots, options.robots, options.robots_by)
@@ -307,8 +319,10 @@ class LiveRun:
         return self._shown(instance, loaded)
 
     def _shown(self, instance: Instance, loaded: bool = False) -> NDArray[np.float32]:
-        """The context as the selector is shown it."""
-        context = self._encoded(self.encoder, instance, loaded)
+        return self.shown(self._encoded(self.encoder, instance, loaded), instance)
+
+    def shown(self, context: NDArray[np.float32], instance: Instance) -> NDArray[np.float32]:
+        """The encoder's context of an instance as the selector is shown it."""
         return np.concatenate([context, name_part(instance.task)]) if self.options.context else context
 
     def _encoded(self, encoder: Encoder, instance: Instance, loaded: bool = False) -> NDArray[np.float32]:
@@ -324,14 +338,15 @@ class LiveRun:
         """Go on with the encoder that the first so many decisions speak for, where it is to be asked after them."""
         if (trial := self.options.trial) is None or not trial.due(count):
             return
-        decisions, instances = self.decisions[:count], [self._instance(index) for index in range(count)]
+        decisions, instances = self.decisions[:count], [self.instance(index) for index in range(count)]
         found = trial.ask(decisions, self.selector.policies, lambda encoder: np.stack([self._encoded(encoder, item) for item in instances]))
         if found is not self.encoder:
             self.encoder = found
             self.selector, self._changes = trial.make(found)
             tell_again(self.selector, self._changes, decisions, [self._shown(item) for item in instances], self._learn)
 
-    def _reward(self, outcome: Outcome) -> float | None:
+    def reward(self, outcome: Outcome) -> float | None:
+        """What the selector learns of an outcome; None of an error."""
         return None if outcome.error is not None else reward(outcome, self.options.weights)
 
     def _learn(self, context: NDArray[np.float32], choice: Choice, decision: Decision) -> None:
@@ -357,7 +372,7 @@ class LiveRun:
             index=index,
             policy=choice.policy,
             propensities=dict(choice.propensities),
-            reward=self._reward(outcome),
+            reward=self.reward(outcome),
             fallback=outcome.fallback,
             error=outcome.error,
             scene=scene,
@@ -370,3 +385,13 @@ def _about(instance: Instance) -> dict[str, Any]:
     """What a decision says of its instance."""
     names = ("task", "seed", "level", "axes", "split", "instruction", "phrasing", "target", "container")
     return {**{name: getattr(instance, name) for name in names}, "robot": instance.other_robot}
+
+
+MakeDecisions = Callable[[LiveRun, int, Callable[[], bool]], None]
+"""Makes the decisions of a run until there are so many, or the function last given says to stop."""
+
+
+def one_after_another(run: LiveRun, decisions: int, stop: Callable[[], bool]) -> None:
+    """Make them in this process."""
+    while len(run.decisions) < decisions and not stop():
+        run.decide()

@@ -74,6 +74,13 @@ class RunSubscriber:
         """
         return ()
 
+    def on_elsewhere(self, index: int, took: Mapping[str, Any]) -> None:
+        """The episodes of a decision ran in a worker process, where `watch` of most subscribers is not asked (`osel_sim.episodes.side_by_side`).
+
+        Args:
+            took: `seconds` of the decision, of them `context_and_choice`, and `episodes`, as `timing.jsonl` has them.
+        """
+
     def on_decision(self, decision: Decision, rewards: Mapping[str, float | None]) -> None:
         """A decision is made; it goes into the journal next.
 
@@ -106,6 +113,7 @@ class TimingFile(RunSubscriber):
         self._start = self._chosen = 0.0
         self._episodes: dict[str, Timing] = {}
         self._row: dict[str, Any] = {}
+        self._elsewhere: Mapping[str, Any] = {}
 
     @override
     def on_start(self, run: Run) -> None:
@@ -113,7 +121,11 @@ class TimingFile(RunSubscriber):
 
     @override
     def on_instance(self, index: int) -> None:
-        self._start, self._episodes = time.perf_counter(), {}
+        self._start, self._episodes, self._elsewhere = time.perf_counter(), {}, {}
+
+    @override
+    def on_elsewhere(self, index: int, took: Mapping[str, Any]) -> None:
+        self._elsewhere = took
 
     @override
     def on_choice(self, index: int, policy: str) -> None:
@@ -132,6 +144,7 @@ class TimingFile(RunSubscriber):
             "seconds": time.perf_counter() - self._start,
             "context_and_choice": self._chosen - self._start,
             "episodes": {policy: {"seconds": timing.seconds, "calls": timing.calls} for policy, timing in self._episodes.items()},
+            **self._elsewhere,
         }
 
     @override

@@ -40,6 +40,7 @@ def curves(
     axes: tuple[str, str],
     y_domain: tuple[float, float] | None = None,
     steps: bool = False,
+    marks: Sequence[float] = (),
 ) -> Panel:
     """Lines with their bands; pointing at a place tells the values there.
 
@@ -48,6 +49,7 @@ def curves(
         axes: titles of the two axes, with their units.
         y_domain: limits of the y axis, beyond which lines are cut off; of what is there where None.
         steps: each value holds up to the next x.
+        marks: where thin upright lines stand.
     """
     places = np.asarray(x, np.float64)
     base = unfolded(*(_record(places, line) for line in lines))
@@ -59,6 +61,9 @@ def curves(
     interpolate: Any = "step-after" if steps else "linear"
     clip = _goes_beyond(lines, y_domain)
     layers: list[alt.Chart] = []
+    if marks:
+        upright = unfolded({"x": numbers(marks)}).mark_rule(stroke=LIGHT["muted"], strokeDash=[2, 3], strokeWidth=1)
+        layers.append(upright.encode(x=x_axis))
     if any(line.low is not None for line in lines):
         band = base.mark_area(fillOpacity=0.16, clip=clip, interpolate=interpolate)
         layers.append(

@@ -32,6 +32,7 @@ from osel_sim.reporting.monitor_section import monitor_sections
 from osel_sim.reporting.off_policy_section import off_policy_table
 from osel_sim.reporting.page import Block, Episodes, Page, Section, Tile, Verdict
 from osel_sim.reporting.palette import colours
+from osel_sim.reporting.robots_section import robots_sections
 from osel_sim.reporting.routes import Chosen, route_figure
 from osel_sim.reporting.selector_sections import ORACLES, Stream, curve_figure, look_of, penalty_figure, regret_figure
 from osel_sim.reporting.verdict_tiles import shown_verdict
@@ -71,7 +72,7 @@ def run_page(folder: Path, scenes: Scenes = no_scenes, beside: Path | None = Non
     if any(decision.reward is not None for decision in run.decisions):
         blocks.append(off_policy_table(evaluate(run.live, run.weights)))
     sections = [*warnings_section(folder), Section("curves", "Learning", blocks), *encoder_section(folder), *run_budget(folder, run.decisions)]
-    sections += monitor_sections(run.live, run.weights)
+    sections += [*monitor_sections(run.live, run.weights), *robots_sections(run.live, run.weights, budget // 2)]
     try:
         sections += log_sections(run.log, run.weights)[0]
     except DataError as error:  # a run without counterfactual knows too little for some tables

@@ -1,4 +1,4 @@
-"""What sharing is worth to several robots, on the page of a replay."""
+"""What sharing is worth to several robots, on the pages of replays and live runs."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,10 +22,11 @@ def sharing_sections(result: Mapping[str, Any]) -> list[Section]:
         result: of `replay.json`.
     """
     sharing = result.get("sharing")
-    return [] if not sharing else [Section("sharing", "Robots that share", [_figure(sharing), _table(sharing)])]
+    return [] if not sharing else [Section("sharing", "Robots that share", [sharing_figure(sharing), sharing_table(sharing)])]
 
 
-def _figure(sharing: Mapping[str, Any]) -> Figure:
+def sharing_figure(sharing: Mapping[str, Any]) -> Figure:
+    """Learning curves of the robots alone, as they share, and of one that sees everything, a panel a selector."""
     ways = list(next(iter(sharing["selectors"].values()))["ways"])
     colours = {"none": "muted", "all": "ink"}
     look = Look({way: colours.get(way, "c1") for way in ways}, {"all"})
@@ -46,7 +47,8 @@ def _figure(sharing: Mapping[str, Any]) -> Figure:
     )
 
 
-def _table(sharing: Mapping[str, Any]) -> Table:
+def sharing_table(sharing: Mapping[str, Any]) -> Table:
+    """What each of that comes to, and how much of the gap sharing closes."""
     ways = list(next(iter(sharing["selectors"].values()))["ways"])
     rows: list[dict[str, Cell]] = [
         {

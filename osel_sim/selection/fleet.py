@@ -2,7 +2,8 @@
 
 In a round every robot decides once, all at the same time: nobody knows in it what comes of the others' decisions in the same round. After every
 `every`-th round each shares; what was shared arrives `delay` rounds later, before the robots decide again, and meanwhile they go on with what they
-know. That order is declared, not an accident of timing, so that nothing depends on how many processes make the decisions.
+know. That order is declared, not an accident of timing, so that nothing depends on how many processes make the decisions: a robot need not wait for
+the others' rounds to end, but for what is to have arrived by its next decision (`Fleet.can_decide`).
 """
 
 from collections.abc import Callable
@@ -75,9 +76,11 @@ class Fleet:
         self.selectors = [one] * robots if sharing.central else [one, *(make(robot) for robot in range(1, robots))]
         if sharing.every is not None:
             self._members()
-        self._rounds = 0
-        self._decided: list[tuple[int, Context, Choice, float]] = []  # in this round, not yet learned from
-        self._under_way: list[tuple[int, list[State]]] = []  # from which round on it is known, what was shared
+        self._asked = [0] * robots  # rounds in which each has chosen
+        self._rounds = [0] * robots  # that each has ended
+        self._decided: dict[int, tuple[Context, Choice, float]] = {}  # by robot, in the round at hand; not yet learned from
+        self._shared: dict[int, dict[int, State]] = {}  # after which round -> robot -> its message, until all have taken it in
+        self._taken = [0] * robots  # exchanges that each has taken in
         self._messages, self._bytes = 0, 0
 
     @property
@@ -94,31 +97,64 @@ class Fleet:
         for member in members[1:]:
             member.begin(first)
 
+    def can_decide(self, robot: int) -> bool:
+        """Whether all is there that a robot is to know, or that is to be drawn, before its next decision."""
+        now = self._rounds[robot]
+        if self.sharing.central:  # one selector draws for all, in their order, when it has learned from all
+            return min(self._rounds) == now and min(self._asked[:robot], default=now + 1) > now
+        return self.sharing.every is None or now < self._due(robot)
+
     def select(self, robot: int, context: Context) -> Choice:
         """What a robot chooses."""
+        self._asked[robot] += 1
         return self.selectors[robot].select(context)
 
     def update(self, robot: int, context: Context, choice: Choice, reward: float) -> None:
-        """What came of a robot's choice; it is learned at the end of the round."""
-        self._decided.append((robot, context, choice, reward))
+        """What came of a robot's choice; it is learned at the end of the robot's round."""
+        self._decided[robot] = (context, choice, reward)
 
     def end_round(self) -> None:
-        """Learn from the round, share where it is time, and take in what has arrived by now."""
-        for robot, context, choice, reward in sorted(self._decided, key=lambda one: one[0]):
-            self.selectors[robot].update(context, choice, reward)
-        self._decided.clear()
-        self._rounds += 1
+        """End the round of all robots, of those too that made no decision in it."""
+        for robot in range(self.robots):
+            self.end_turn(robot)
+
+    def end_turn(self, robot: int) -> None:
+        """End a robot's round: it learns from it, shares where it is time, and everyone takes in what has arrived by now."""
+        self._rounds[robot] += 1
+        self._asked[robot] = self._rounds[robot]  # also where it did not choose
+        if not self.sharing.central:
+            self._learn(robot)
+        elif min(self._rounds) == self._rounds[robot]:  # the last of them
+            for one in range(self.robots):
+                self._learn(one)
         if self.sharing.every is None:
             return
-        if self._rounds % self.sharing.every == 0:
-            messages = [member.share() for member in self._members()]
-            self._under_way.append((self._rounds + self.sharing.delay, messages))
-            self._messages += len(messages)
-            self._bytes += sum(value.nbytes if isinstance(value, np.ndarray) else 8 for message in messages for value in message.values())
-        while self._under_way and self._under_way[0][0] <= self._rounds:
-            _, messages = self._under_way.pop(0)
-            for robot, member in enumerate(self._members()):
-                member.absorb(messages, robot)
+        if self._rounds[robot] % self.sharing.every == 0:
+            message = self._members()[robot].share()
+            self._shared.setdefault(self._rounds[robot], {})[robot] = message
+            self._messages += 1
+            self._bytes += sum(value.nbytes if isinstance(value, np.ndarray) else 8 for value in message.values())
+        for one in range(self.robots):
+            self._take_in(one)
+
+    def _learn(self, robot: int) -> None:
+        if robot in self._decided:
+            self.selectors[robot].update(*self._decided.pop(robot))
+
+    def _due(self, robot: int) -> int:
+        """Rounds that a robot can end before it must know the exchange that comes next."""
+        return (self._taken[robot] + 1) * (self.sharing.every or 1) + self.sharing.delay
+
+    def _take_in(self, robot: int) -> None:
+        """Take in what is to have arrived by now, as far as it is there."""
+        while self._rounds[robot] >= self._due(robot):
+            messages = self._shared.get(sent := self._due(robot) - self.sharing.delay, {})
+            if len(messages) < self.robots:
+                return
+            self._members()[robot].absorb([messages[one] for one in range(self.robots)], robot)
+            self._taken[robot] += 1
+            if min(self._taken) == self._taken[robot]:
+                del self._shared[sent]
 
     def _members(self) -> list[Shares]:
         for selector in self.selectors:
@@ -137,31 +173,34 @@ class InTurn:
 
     Args:
         fleet: begun with the first decision: what its selectors were shown before is common knowledge.
+
+    Attributes:
+        decisions: made so far.
     """
 
     name = "several robots"
 
     def __init__(self, fleet: Fleet) -> None:
-        self.fleet, self.policies, self._decisions = fleet, fleet.selectors[0].policies, 0
+        self.fleet, self.policies, self.decisions = fleet, fleet.selectors[0].policies, 0
 
     def select(self, context: Context) -> Choice:
         """What the robot whose turn it is chooses. Before the first of a round what the last one taught is learned."""
-        robot = self._decisions % self.fleet.robots
-        if self._decisions == 0:
+        robot = self.decisions % self.fleet.robots
+        if self.decisions == 0:
             self.fleet.begin()
         elif robot == 0:
             self.fleet.end_round()
-        self._decisions += 1
+        self.decisions += 1
         return self.fleet.select(robot, context)
 
     def update(self, context: Context, choice: Choice, reward: float) -> None:
         """What came of the last choice."""
-        self.fleet.update((self._decisions - 1) % self.fleet.robots, context, choice, reward)
+        self.fleet.update((self.decisions - 1) % self.fleet.robots, context, choice, reward)
 
     def state_dict(self) -> State:
         """The robots' states, `robot0.` and so on before the names; what one selector knows for all is there once."""
         states = {f"{ROBOT}{number}.{key}": value for number, one in enumerate(members(self)) for key, value in one.state_dict().items()}
-        return {"selector": "fleet", "robots": self.fleet.robots, "share": str(self.fleet.sharing), "decisions": self._decisions, **states}
+        return {"selector": "fleet", "robots": self.fleet.robots, "share": str(self.fleet.sharing), "decisions": self.decisions, **states}
 
     def load_state_dict(self, state: State) -> None:
         """A run that goes on learns from its journal."""
