@@ -155,6 +155,13 @@ def test_a_selector_that_cannot_is_named(log, tmp_path):
     assert done.result is not None and done.result["selectors"]["Stranger"]["shares"]["cheap"] == 1.0
 
 
+@pytest.mark.parametrize("setting", [{"margin": 0.01}, {"route_with": ["linucb"]}])
+def test_what_is_for_a_verdict_is_refused_where_there_is_none(log, tmp_path, setting):
+    with pytest.raises(SettingError, match="streams that change have none"):
+        osel_sim.replay(log, selectors=["linucb"], join="dear@30", out=tmp_path / "out", **setting)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.fixture(scope="module")
 def replayed(log, tmp_path_factory):
     out = tmp_path_factory.mktemp("replay") / "out"

@@ -129,7 +129,7 @@ class _Replay:
         from osel_sim.analysis.log import read_log
         from osel_sim.analysis.logged_choices import choices_of, has_choices
         from osel_sim.api.replay_budgets import check_budget
-        from osel_sim.api.replay_changes import check_all_outcomes
+        from osel_sim.api.replay_changes import check_all_outcomes, check_changes
         from osel_sim.formats.replay_result import check_replay_folder, write_off_policy
 
         config, folder = self.config, self.config.folder
@@ -141,6 +141,7 @@ class _Replay:
         check_replay_folder(folder, config.overwrite)
         self._robots(selectors)  # refuses what cannot be, before anything is read
         check_budget(config, True)
+        check_changes(config)
         if not is_live_run(config.log):
             log = read_log(config.log, None if config.encoder == AUTO else config.encoder)
             weights, preset = weights_of(config, log.metadata)

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from osel_sim.core.errors import UsageError
+from osel_sim.core.errors import SettingError, UsageError
 
 if TYPE_CHECKING:
     from osel_sim.analysis.engine import Setup
@@ -20,6 +20,17 @@ logger = logging.getLogger(__name__)
 def changes_asked(config: "ReplayConfig") -> bool:
     """Whether anything is to change."""
     return bool(config.join or config.leave or config.drift)
+
+
+def check_changes(config: "ReplayConfig") -> None:
+    """Refuse settings of the verdict for streams that change: what is reported of those are the changes.
+
+    Raises:
+        SettingError: there is one.
+    """
+    for name in ("margin", "route_with"):
+        if changes_asked(config) and name in config.given:
+            raise SettingError(name, "is for a verdict, and streams that change have none: leave it out, or --join, --leave and --drift")
 
 
 def check_all_outcomes(config: "ReplayConfig", known: bool) -> None:
