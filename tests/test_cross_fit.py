@@ -13,6 +13,17 @@ def test_each_half_is_told_what_the_other_says():
     assert cross_fit(FIRST, lambda by, on: np.full(on.sum(), values[by].mean())).tolist() == [5.0] * 4 + [1.0] * 4
 
 
+def test_where_one_half_is_empty_both_are_asked_all_the_same():
+    asked: list[tuple[int, int]] = []
+
+    def decide(by, on):
+        asked.append((by.sum(), on.sum()))
+        return np.zeros(on.sum())
+
+    assert len(cross_fit(np.ones(3, bool), decide)) == len(cross_fit(np.zeros(3, bool), decide)) == 3
+    assert asked == [(0, 3), (3, 0), (3, 0), (0, 3)]
+
+
 def test_luck_is_no_foresight_across_halves():
     coins = (np.random.default_rng(0).random((4000, 2)) < 0.5).astype(float)
     groups, first = np.arange(4000) // 4, np.arange(4000) % 2 == 0

@@ -1,6 +1,6 @@
 """Cross-fitting: policies chosen on one half of the instances and scored on the other, both ways round, so that luck does not count as foresight."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,10 +17,11 @@ def cross_fit(first: Rows, decide: Decide) -> NDArray[Any]:
     """What each half of the instances says about the other, (N, ...).
 
     Args:
-        first: (N,) the instances of one half; neither none nor all.
+        first: (N,) the instances of one half. Where that is none or all of them, as in the log of a run that has just begun, nothing says something
+            about all, and all about nothing.
         decide: called for the first half's sake, then for the second's.
     """
-    return cross_fit_parts((~first).astype(np.int64), decide)
+    return _cross_fit([first, ~first], decide)
 
 
 def cross_fit_parts(parts: NDArray[np.int64], decide: Decide) -> NDArray[Any]:
@@ -30,8 +31,12 @@ def cross_fit_parts(parts: NDArray[np.int64], decide: Decide) -> NDArray[Any]:
         parts: (N,) number of the part that each instance is in; at least two.
         decide: called for each part's sake, in the order of their numbers.
     """
-    told = [(parts == part, decide(parts != part, parts == part)) for part in np.unique(parts)]
-    result = np.empty((len(parts), *told[0][1].shape[1:]), told[0][1].dtype)
+    return _cross_fit([parts == part for part in np.unique(parts)], decide)
+
+
+def _cross_fit(parts: Sequence[Rows], decide: Decide) -> NDArray[Any]:
+    told = [(on, decide(~on, on)) for on in parts]
+    result = np.empty((len(parts[0]), *told[0][1].shape[1:]), told[0][1].dtype)
     for on, values in told:
         result[on] = values
     return result
