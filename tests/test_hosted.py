@@ -30,11 +30,6 @@ class ToyHost(Host):
     def __init__(self, manners: str = "good") -> None:
         super().__init__("toy", SuiteEnvironment("gym"))
         self.manners = manners
-        self.asked: list[str] = []
-
-    def ask(self, message, life=None):
-        self.asked.append(message["do"])
-        return super().ask(message, life)
 
     def command(self, ready: int) -> list[str]:
         return [sys.executable, toy_host.__file__, str(ready), self.manners]
@@ -69,38 +64,6 @@ def test_it_is_the_environment_of_this_process_to_the_byte(env):
         assert there.keys() == expected.keys() and all(np.array_equal(there[key], expected[key]) for key in expected)
         assert env.steps == here.steps and env.done == here.done
         there["observation.images.top"][0] = 0  # its own, and not what came over the wire
-
-
-def test_what_is_looked_at_after_every_chunk_comes_with_the_chunk(env, host):
-    here = Point()
-    here.load(INSTANCE)
-
-    def both(*values: float, size: int = 32):
-        for number in range(0, len(values), 2):
-            env.advance_chunk(chunk(*values[number : number + 2]))
-        for action in chunk(*values):
-            here.advance(action)
-        for wanted in [size] if size == 32 else [size, 32, size]:  # also one after the other
-            there, expected = env.observe(["top"], wanted), here.observe(["top"], wanted)
-            assert all(np.array_equal(there[key], expected[key]) for key in expected)
-            assert np.array_equal(env.observe(["top"], wanted)["observation.state"], there["observation.state"])
-
-    host.asked.clear()
-    both()
-    assert host.asked == ["observe", "observe"], "nobody has looked before"
-    host.asked.clear()
-    both(0.5, -0.25)
-    both(0.75)
-    here.load(INSTANCE)
-    env.load(INSTANCE)
-    both()
-    assert host.asked == ["advance", "advance", "load"]
-    both(0.5, size=16)
-    both(0.5, size=16)
-    host.asked.clear()
-    both(*[0.125] * 6)
-    both(*[0.125] * 6)
-    assert host.asked == [*["advance"] * 3, "observe", "observe"] * 2, "who looks after every third chunk is not shown more"
 
 
 def test_it_needs_no_threads_and_leaves_no_process_behind(host):

@@ -57,7 +57,7 @@ class Table:
             "load": self._load,
             "observe": lambda env, message: {"observation": env.observe(message["cameras"], message["size"])},
             "image": lambda env, message: {"image": env.image(message["camera"], message["width"], message["height"], message["quality"])},
-            "advance": lambda env, message: {"made": advance_chunk(env, message["actions"]), **stands(env, message)},
+            "advance": lambda env, message: {"made": advance_chunk(env, message["actions"]), "status": status(env)},
             "scene": lambda env, message: {"scene": env.scene_digest() if isinstance(env, TellsScene) else ""},
             "snapshot": lambda env, message: {"snapshot": env.snapshot()},
             "restore": self._restore,
@@ -95,11 +95,11 @@ class Table:
 
     def _load(self, env: Environment, message: Message) -> Message:
         env.load(PlainInstance(**message["instance"]))
-        return stands(env, message)
+        return {"status": status(env)}
 
     def _restore(self, env: Environment, message: Message) -> Message:
         env.restore(message["snapshot"])
-        return stands(env, message)
+        return {"status": status(env)}
 
     def _expert(self, env: Environment, message: Message) -> Message:
         if not isinstance(env, HasExpert):
@@ -128,13 +128,6 @@ def status(env: Environment) -> Message:
         "done": bool(env.done),
         "hold": env.hold_action(),
     }
-
-
-def stands(env: Environment, message: Message) -> Message:
-    """How an environment stands after a message that changed it, and what is to be seen `then`, where it says so and the episode goes on."""
-    then = message.get("then")
-    seen = {} if then is None or env.done else {"observation": env.observe(then["cameras"], then["size"])}
-    return {"status": status(env), **seen}
 
 
 def advance_chunk(env: Environment, actions: Any) -> int:

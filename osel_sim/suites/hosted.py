@@ -134,41 +134,6 @@ def host_of(suite: str, where: str) -> Host:
     return host
 
 
-class Foreseen:
-    """What an environment will be asked to show after its next change, so that it comes with the answer to the change: half as many questions.
-
-    That is what it was last asked for, where that was after one change (a chunk, a reset). What is not asked for was rendered in vain, and ends it.
-    """
-
-    def __init__(self) -> None:
-        self._wanted: Message | None = None
-        self._had: tuple[Message, Observation] | None = None
-        self._changes, self._in_vain = 0, False
-
-    def wanted(self) -> Message | None:
-        """What is to be shown after a change that is under way; None: nothing."""
-        if self._in_vain:
-            self._wanted = None
-        self._had, self._in_vain = None, False
-        self._changes += 1
-        return self._wanted
-
-    def got(self, observation: Observation | None) -> None:
-        """What came with the answer; None where it was not asked for, or the episode is over."""
-        if self._wanted is not None and observation is not None:
-            self._had, self._in_vain = (self._wanted, observation), True
-
-    def take(self, wanted: Message) -> Observation | None:
-        """What is asked for, if it has come already."""
-        changes, self._changes = self._changes, 0
-        if self._had is not None and self._had[0] == wanted:
-            self._in_vain = False
-            return self._had[1]
-        if changes:
-            self._wanted = wanted if changes == 1 else None
-        return None
-
-
 class HostedEnvironment:
     """An environment of a host process, and an `Environment` and `TakesChunks` of this one.
 
@@ -182,7 +147,6 @@ class HostedEnvironment:
         self._instance: PlainInstance | None = None
         self._status: Message = {}
         self._closed = False
-        self._foreseen = Foreseen()
         self._open()
 
     @property
@@ -219,7 +183,7 @@ class HostedEnvironment:
         """Reset to an instance, in a fresh host where the last one has ended."""
         self._instance = instance
         self._untouched = True
-        self._change("load", instance=dataclasses.asdict(instance))
+        self._status = self._ask("load", instance=dataclasses.asdict(instance))["status"]
 
     def advance(self, action: NDArray[Any]) -> None:
         """One control step."""
@@ -228,14 +192,13 @@ class HostedEnvironment:
     def advance_chunk(self, actions: NDArray[Any]) -> int:
         """Make the actions (T, D) until `done`; how many were made."""
         self._untouched = False
-        return int(self._change("advance", actions=np.asarray(actions, np.float32))["made"])
+        answer = self._ask("advance", actions=np.asarray(actions, np.float32))
+        self._status = answer["status"]
+        return int(answer["made"])
 
     def observe(self, cameras: Sequence[str], size: int) -> Observation:
         """What a policy is shown now."""
-        wanted = {"cameras": list(cameras), "size": size}
-        observation = self._foreseen.take(wanted)
-        if observation is None:
-            observation = self._ask("observe", **wanted)["observation"]
+        observation = self._ask("observe", cameras=list(cameras), size=size)["observation"]
         return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in observation.items()}
 
     def hold_action(self) -> Actions:
@@ -258,7 +221,7 @@ class HostedEnvironment:
         """Back to a snapshot, in a fresh host where the last one has ended."""
         self._instance, status, state = snapshot
         self._untouched = True
-        self._change("restore", snapshot=state)
+        self._status = self._ask("restore", snapshot=state)["status"]
         self._untouched = status["steps"] == 0
 
     def expert(self) -> "HostedExpert":
@@ -293,13 +256,6 @@ class HostedEnvironment:
         self._landmark_names = tuple(answer["landmarks"])
         self._status = {"steps": 0, "success": False, "subgoals": 0.0, "done": False, "hold": []}
         self._untouched = True
-
-    def _change(self, do: str, **arguments: Any) -> Message:
-        """The answer to what changes the environment, and how that stands from then on."""
-        answer = self._ask(do, then=self._foreseen.wanted(), **arguments)
-        self._status = answer["status"]
-        self._foreseen.got(answer.get("observation"))
-        return answer
 
     def _ask(self, do: str, **arguments: Any) -> Message:
         """An answer. Where the host has ended and nothing has moved yet, a fresh one comes to the same beginning."""
