@@ -96,6 +96,7 @@ def test_what_is_played_again_in_the_runs_own_order_is_what_the_run_did(toy, tmp
     assert np.allclose(entry["ways"]["every:2"]["curve"], received.cumsum() / np.arange(1, 7), atol=1e-12)
 
 
+@pytest.mark.slow  # 20 s and more
 def test_a_killed_run_of_workers_comes_back_to_the_same_bytes(toy, site, tmp_path):
     def command(out: Path, *more: str) -> list[str]:
         fixed = [
@@ -143,6 +144,7 @@ class Interrupting(RunSubscriber):
             os.kill(os.getpid(), signal.SIGINT)
 
 
+@pytest.mark.slow  # 20 s and more
 def test_an_interrupted_run_leaves_no_gap_and_goes_on(toy, tmp_path):
     settings = {**toy, "selector": "ucb1", "robots": 4, "share": "every:2", "episodes": 24, "out": tmp_path / "run"}
     watcher = Interrupting(5)
