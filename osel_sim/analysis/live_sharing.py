@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from osel_sim.analysis.engine import Setup
 from osel_sim.analysis.live import LiveLog
@@ -99,10 +98,3 @@ def played_again(live: LiveLog, fleet: RunFleet, weights: RewardWeights, budget:
     except UsageError:
         return "There are too few decisions yet to play them again."
     return found | {"by": fleet.by, "orders": len(seeds)}
-
-
-def mean_so_far(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of what is not NaN up to each place; NaN before the first."""
-    known = np.isfinite(values)
-    total, number = np.where(known, values, 0.0).cumsum(), known.cumsum()
-    return np.where(number > 0, total / np.maximum(number, 1), np.nan)

@@ -16,8 +16,8 @@ from osel_sim.statistics.intervals import Interval
 
 LEAST_EFFECTIVE = 100.0
 """Estimates that rest on fewer effective decisions are shown nowhere: normal intervals of so few do not hold, and one lucky choice decides. In
-simulated runs of `auto`, `thompson`, `lints` and `random` 95 % intervals hold the truth in 95 % or more from here on, in 67 to 99 % of those that
-rest on fewer than 30 (`benchmarks/interval_coverage.py`)."""
+simulated runs of `auto`, `thompson`, `lints` and `random` 95 % intervals hold the truth in about 95 % or more from here on, and in
+fewer of those that rest on less (`benchmarks/interval_coverage.py`)."""
 
 WAYS = ("ips", "snips", "dr")
 """Fields of `OffPolicyEstimate`, each with its `_ci95` and `_effective`."""

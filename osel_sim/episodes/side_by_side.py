@@ -69,9 +69,8 @@ class _Decisions:
         self.played: dict[int, Played] = {}
         if not made:
             self.fleet.begin()
-        for index in range(
-            max(0, made - 1) // self.robots * self.robots, made
-        ):  # of these the robots have not learned when they go through the journal
+        # Of the last round the robots have not learned when they go through the journal.
+        for index in range(max(0, made - 1) // self.robots * self.robots, made):
             self._end_turn(index)
 
     def make(self, stop: Callable[[], bool]) -> None:

@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.estimate import mean_of, rate_of
 from osel_sim.analysis.live import LiveLog
-from osel_sim.analysis.live_sharing import RunFleet, fleet_of, mean_so_far, played_again
+from osel_sim.analysis.live_sharing import RunFleet, fleet_of, played_again
 from osel_sim.analysis.sharing_words import live_about, live_conclusion, not_played_again
 from osel_sim.reporting.charts import Figure, Look, listed
 from osel_sim.reporting.curves import Line, curves, settled_domain, thinned
 from osel_sim.reporting.html_tables import Cell, Column, Table
 from osel_sim.reporting.page import Block, Section
+from osel_sim.reporting.selector_sections import running_mean
 from osel_sim.reporting.sharing_section import sharing_figure, sharing_table
 from osel_sim.selection.reward import RewardWeights
 
@@ -49,7 +50,7 @@ def robots_sections(live: LiveLog, weights: RewardWeights, budget: int) -> list[
 
 
 def _figure(fleet: RunFleet, rewards: NDArray[np.float64]) -> Figure:
-    own = {f"robot {robot}": mean_so_far(rewards[robot :: fleet.count]) for robot in range(fleet.count) if robot < len(rewards)}
+    own = {f"robot {robot}": running_mean(rewards[robot :: fleet.count]) for robot in range(fleet.count) if robot < len(rewards)}
     rounds = max(map(len, own.values()))
     at, arrivals = thinned(rounds), fleet.arrivals(rounds)
     shown = dict(list(own.items())[:_MOST_LINES])
