@@ -61,11 +61,12 @@ def stock_episode(env: Any, actions: np.ndarray) -> None:
 
 def our_episode(env: Environment, instance: Any, actions: np.ndarray, size: int) -> None:
     env.load(instance)
+    look = [CAMERA], size
     for start in range(0, len(actions), EVERY):
-        env.observe([CAMERA], size)
+        env.observe(*look)
         chunk = actions[start : start + EVERY]
-        if isinstance(env, HostedEnvironment):
-            env.advance_chunk(chunk)
+        if isinstance(env, HostedEnvironment):  # as the episode loop does
+            env.advance_chunk(chunk, look if start + EVERY < len(actions) else None)
         else:
             for action in chunk:
                 env.advance(action)

@@ -219,7 +219,7 @@ class Episode:
                 return call.failure
             self.tallies[-1].paid_per_action = call.paid_per_action  # only now: what was made while waiting is of the answer before
             stop = max(made, driver.spec.execute)
-            self._make(call.actions[made:stop])
+            self._make(call.actions[made:stop], then_look=True)
             self.rest, self.planner = call.actions[stop:], len(self.tallies) - 1
         return None
 
@@ -298,11 +298,13 @@ class Episode:
         self._hold(steps - made)
         return made
 
-    def _make(self, actions: Actions, planner: int = -1) -> int:
+    def _make(self, actions: Actions, planner: int = -1, then_look: bool = False) -> int:
         """Make the actions (T, D) of a policy, an index of the tallies, until the episode is over. Returns how many were made."""
         unseen = len(actions) - (self.history.length - 1)
-        if self.chunked is not None and unseen > 1 and not self.env.done:
-            made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions[:unseen]]))
+        if self.chunked is not None and unseen > 0 and not self.env.done:
+            spec = self.tallies[-1].spec
+            then = (spec.cameras, spec.image_size) if then_look or unseen < len(actions) else None
+            made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions[:unseen]]), then)
             self.tallies[planner].made(made)
             return made if made < unseen or unseen == len(actions) else made + self._make(actions[unseen:], planner)
         for made, action in enumerate(actions):

@@ -218,8 +218,15 @@ class TakesChunks(Protocol):
     The episode loop sends chunks where nobody watches single steps (a video does).
     """
 
-    def advance_chunk(self, actions: NDArray[Any]) -> int:
-        """Make the actions (T, D) one after the other until `done`. Returns how many were made."""
+    def advance_chunk(self, actions: NDArray[Any], then: tuple[Sequence[str], int] | None = None) -> int:
+        """Make the actions (T, D) one after the other until `done`.
+
+        Args:
+            then: cameras and size that `observe` will be asked for next, unless the episode is over: what they show may come with the answer.
+
+        Returns:
+            how many were made.
+        """
         ...
 
 

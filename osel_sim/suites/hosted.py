@@ -1,7 +1,8 @@
 """Environments that run in a host process, in their suite's own Python environment, as environments of this process.
 
-A chunk of actions goes over at once, images come when they are asked for, and what the episode loop asks after every step (steps, success, whether it
-is over) is known here. A host that has ended is an error of the episode under way, and the next one has a fresh host: nobody else notices.
+A chunk of actions goes over at once. Images come when they are asked for, or with the answer to a chunk that says what is looked at next. What the
+episode loop asks after every step (steps, success, whether it is over) is known here. A host that has ended is an error of the episode under way,
+and the next one has a fresh host: nobody else notices.
 """
 
 import atexit
@@ -146,6 +147,7 @@ class HostedEnvironment:
         self._host, self._task = host, task
         self._instance: PlainInstance | None = None
         self._status: Message = {}
+        self._seen: tuple[tuple[list[str], int], Message] | None = None
         self._closed = False
         self._open()
 
@@ -182,23 +184,30 @@ class HostedEnvironment:
     def load(self, instance: PlainInstance) -> None:
         """Reset to an instance, in a fresh host where the last one has ended."""
         self._instance = instance
-        self._untouched = True
+        self._untouched, self._seen = True, None
         self._status = self._ask("load", instance=dataclasses.asdict(instance))["status"]
 
     def advance(self, action: NDArray[Any]) -> None:
         """One control step."""
         self.advance_chunk(np.asarray(action)[None])
 
-    def advance_chunk(self, actions: NDArray[Any]) -> int:
-        """Make the actions (T, D) until `done`; how many were made."""
-        self._untouched = False
-        answer = self._ask("advance", actions=np.asarray(actions, np.float32))
+    def advance_chunk(self, actions: NDArray[Any], then: tuple[Sequence[str], int] | None = None) -> int:
+        """Make the actions (T, D) until `done`; how many were made. What is to be observed `then` comes with the answer."""
+        self._untouched, self._seen = False, None
+        look = None if then is None else (list(then[0]), then[1])
+        answer = self._ask("advance", actions=np.asarray(actions, np.float32), then=look)
         self._status = answer["status"]
+        if look is not None and "observation" in answer:
+            self._seen = look, answer["observation"]
         return int(answer["made"])
 
     def observe(self, cameras: Sequence[str], size: int) -> Observation:
         """What a policy is shown now."""
-        observation = self._ask("observe", cameras=list(cameras), size=size)["observation"]
+        look = list(cameras), size
+        if self._seen is not None and self._seen[0] == look:
+            observation = self._seen[1]
+        else:
+            observation = self._ask("observe", cameras=look[0], size=size)["observation"]
         return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in observation.items()}
 
     def hold_action(self) -> Actions:
@@ -220,7 +229,7 @@ class HostedEnvironment:
     def restore(self, snapshot: Any) -> None:
         """Back to a snapshot, in a fresh host where the last one has ended."""
         self._instance, status, state = snapshot
-        self._untouched = True
+        self._untouched, self._seen = True, None
         self._status = self._ask("restore", snapshot=state)["status"]
         self._untouched = status["steps"] == 0
 
