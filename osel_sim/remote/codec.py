@@ -14,6 +14,7 @@ import numpy as np
 from osel_sim.core.errors import RemoteError
 
 DTYPES = {name: np.dtype(name) for name in ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")}
+NAMES = {dtype: name for name, dtype in DTYPES.items()}
 MAX_DIMENSIONS = 8
 MAX_ITEMS = 4096  # of a list or map; numbers in bulk travel as arrays
 MAX_STRING = 1 << 16
@@ -37,7 +38,7 @@ def pack(message: Any) -> bytes:
 
 
 def unpack(frame: bytes | memoryview) -> Any:
-    """The message of one frame. Its arrays are read-only views of the frame.
+    """The message of one frame. Its arrays are read-only, and share no memory with the frame.
 
     Raises:
         ProtocolError: saying what is wrong with it.
@@ -61,8 +62,8 @@ def unpack(frame: bytes | memoryview) -> Any:
 def _to_wire(value: Any) -> dict[bytes, Any]:
     if not isinstance(value, (np.ndarray, np.generic)):
         raise TypeError(f"{type(value).__name__} has no wire form")
-    name = value.dtype.str
-    if name not in DTYPES:
+    name = NAMES.get(value.dtype)
+    if name is None:
         raise TypeError(f"dtype {value.dtype} has no wire form")
     if isinstance(value, np.ndarray):
         data = value.data if value.flags.c_contiguous else value.tobytes()

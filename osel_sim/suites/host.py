@@ -58,6 +58,7 @@ class Table:
             "observe": lambda env, message: {"observation": env.observe(message["cameras"], message["size"])},
             "image": lambda env, message: {"image": env.image(message["camera"], message["width"], message["height"], message["quality"])},
             "advance": self._advance,
+            "hold": lambda env, message: {"action": env.hold_action()},
             "scene": lambda env, message: {"scene": env.scene_digest() if isinstance(env, TellsScene) else ""},
             "snapshot": lambda env, message: {"snapshot": env.snapshot()},
             "restore": self._restore,
@@ -133,7 +134,6 @@ def status(env: Environment) -> Message:
         "success": bool(env.success),
         "subgoals": float(env.subgoal_fraction),
         "done": bool(env.done),
-        "hold": env.hold_action().tolist(),  # an array costs more than all else of the message
     }
 
 

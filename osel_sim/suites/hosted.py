@@ -212,7 +212,7 @@ class HostedEnvironment:
 
     def hold_action(self) -> Actions:
         """The action (D,) that holds still."""
-        return np.array(self._status["hold"], np.float32)
+        return np.array(self._ask("hold")["action"], np.float32)
 
     def image(self, camera: str, width: int, height: int, quality: str = "fast") -> Image:
         """Image (height, width, 3) of a camera."""
@@ -263,7 +263,7 @@ class HostedEnvironment:
         self._number, self._life = int(answer["env"]), self._host.life
         self._specification = EnvironmentSpec.from_dict(answer["specification"])
         self._landmark_names = tuple(answer["landmarks"])
-        self._status = {"steps": 0, "success": False, "subgoals": 0.0, "done": False, "hold": []}
+        self._status = {"steps": 0, "success": False, "subgoals": 0.0, "done": False}
         self._untouched = True
 
     def _ask(self, do: str, **arguments: Any) -> Message:
