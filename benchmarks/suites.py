@@ -67,7 +67,10 @@ def our_episode(env: Environment, instance: Any, actions: np.ndarray, size: int)
         env.observe(*look)
         chunk = actions[start : start + EVERY]
         if isinstance(env, HostedEnvironment):  # as the episode loop does
-            env.advance_chunk(chunk, look if start + EVERY < len(actions) else None)
+            if start + EVERY < len(actions):
+                env.advance_and_look(chunk, *look)
+            else:
+                env.advance_chunk(chunk)
         else:
             for action in chunk:
                 env.advance(action)

@@ -168,7 +168,7 @@ def test_going_on_from_a_moment_is_what_handing_over_there_would_have_been(env, 
 class ChunkedEnv(LoggedEnv):
     """Takes several actions at once, as an environment in another process does."""
 
-    def advance_chunk(self, actions, then=None):
+    def advance_chunk(self, actions):
         self.chunks = getattr(self, "chunks", 0) + 1
         for number, action in enumerate(actions):
             if self.done:

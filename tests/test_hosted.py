@@ -80,8 +80,8 @@ def test_what_is_to_be_looked_at_next_comes_with_the_chunk(env, host):
     here = Point()
     here.load(INSTANCE)
 
-    def both(*values: float, then=None):
-        env.advance_chunk(chunk(*values), then)
+    def both(*values: float, look=None):
+        assert (env.advance_and_look(chunk(*values), *look) if look else env.advance_chunk(chunk(*values))) == len(values)
         for action in chunk(*values):
             here.advance(action)
 
@@ -90,13 +90,13 @@ def test_what_is_to_be_looked_at_next_comes_with_the_chunk(env, host):
         there["observation.state"][:] += 0  # its own
         return all(np.array_equal(there[key], expected[key]) for key in expected)
 
-    both(0.5, 0.25, then=(("top",), 32))
+    both(0.5, 0.25, look=(("top",), 32))
     host.asked.clear()
     assert same(["top"], 32) and same(("top",), 32) and host.asked == []
     assert same(["top"], 16) and same([], 32) and host.asked == ["observe"] * 2, "something else is asked for"
     both(-0.5)
     assert same(["top"], 32), "what was seen before the last chunk is not shown again"
-    both(0.125, then=(("top",), 32))
+    both(0.125, look=(("top",), 32))
     for world in (here, env):
         world.load(INSTANCE)
     assert same(["top"], 32), "nor before a reset"
@@ -131,14 +131,14 @@ def test_an_episode_asks_once_a_chunk_and_sees_what_it_sees_in_this_process(exec
 
 def test_an_episode_that_is_over_draws_nothing_more(env, host):
     left = env.specification.horizon - env.steps
-    assert env.advance_chunk(chunk(*[0.0] * (left + 5)), (["top"], 32)) == left and env.done
+    assert env.advance_and_look(chunk(*[0.0] * (left + 5)), ["top"], 32) == left and env.done
     host.asked.clear()
     env.observe(["top"], 32)
     assert host.asked == ["observe"]
 
 
 def test_what_cannot_be_shown_is_told_to_whoever_looks(env):
-    assert env.advance_chunk(chunk(0.5), (["no such camera"], -1)) == 1 and env.steps == 1
+    assert env.advance_and_look(chunk(0.5), ["no such camera"], -1) == 1 and env.steps == 1
     with pytest.raises(SuiteHostError, match="the host of suite 'toy'"):
         env.observe(["no such camera"], -1)
 

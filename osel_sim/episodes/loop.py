@@ -25,7 +25,7 @@ from osel_sim.episodes.driver import Tally, monitor_seed
 from osel_sim.episodes.driver import episode_seed as episode_seed
 from osel_sim.episodes.handoffs import Answer, Course, Handoffs, Watch, decided, difference
 from osel_sim.interface.call import Call, Privileged
-from osel_sim.interface.environment import ActionSpec, Environment, TakesChunks
+from osel_sim.interface.environment import ActionSpec, Environment, LooksAhead, TakesChunks
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.monitor import DecisionPoint, Turn
 from osel_sim.interface.outcome import Outcome, Seconds
@@ -302,9 +302,11 @@ class Episode:
         """Make the actions (T, D) of a policy, an index of the tallies, until the episode is over. Returns how many were made."""
         unseen = len(actions) - (self.history.length - 1)
         if self.chunked is not None and unseen > 0 and not self.env.done:
-            spec = self.tallies[-1].spec
-            then = (spec.cameras, spec.image_size) if then_look or unseen < len(actions) else None
-            made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions[:unseen]]), then)
+            chunk, spec = np.stack([self.noise(action) for action in actions[:unseen]]), self.tallies[-1].spec
+            if isinstance(self.chunked, LooksAhead) and (then_look or unseen < len(actions)):
+                made = self.chunked.advance_and_look(chunk, spec.cameras, spec.image_size)
+            else:
+                made = self.chunked.advance_chunk(chunk)
             self.tallies[planner].made(made)
             return made if made < unseen or unseen == len(actions) else made + self._make(actions[unseen:], planner)
         for made, action in enumerate(actions):

@@ -218,15 +218,17 @@ class TakesChunks(Protocol):
     The episode loop sends chunks where nobody watches single steps (a video does).
     """
 
-    def advance_chunk(self, actions: NDArray[Any], then: tuple[Sequence[str], int] | None = None) -> int:
-        """Make the actions (T, D) one after the other until `done`.
+    def advance_chunk(self, actions: NDArray[Any]) -> int:
+        """Make the actions (T, D) one after the other until `done`. Returns how many were made."""
+        ...
 
-        Args:
-            then: cameras and size that `observe` will be asked for next, unless the episode is over: what they show may come with the answer.
 
-        Returns:
-            how many were made.
-        """
+@runtime_checkable
+class LooksAhead(TakesChunks, Protocol):
+    """An environment that can look at once where a chunk ends, so that what is seen there need not be asked for."""
+
+    def advance_and_look(self, actions: NDArray[Any], cameras: Sequence[str], size: int) -> int:
+        """As `advance_chunk`. Unless the episode is over, `observe` will be asked for these cameras in this size next."""
         ...
 
 

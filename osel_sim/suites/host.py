@@ -100,9 +100,9 @@ class Table:
 
     def _advance(self, env: Environment, message: Message) -> Message:
         answer = {"made": advance_chunk(env, message["actions"]), "status": status(env)}
-        if message["then"] is not None and not env.done:
+        if message["look"] is not None and not env.done:
             with contextlib.suppress(Exception):  # told to whoever asks for it
-                answer["observation"] = env.observe(*message["then"])
+                answer["observation"] = env.observe(*message["look"])
         return answer
 
     def _restore(self, env: Environment, message: Message) -> Message:

@@ -136,7 +136,7 @@ def host_of(suite: str, where: str) -> Host:
 
 
 class HostedEnvironment:
-    """An environment of a host process, and an `Environment` and `TakesChunks` of this one.
+    """An environment of a host process, and an `Environment` and `LooksAhead` of this one.
 
     Args:
         host: where it runs.
@@ -191,11 +191,17 @@ class HostedEnvironment:
         """One control step."""
         self.advance_chunk(np.asarray(action)[None])
 
-    def advance_chunk(self, actions: NDArray[Any], then: tuple[Sequence[str], int] | None = None) -> int:
-        """Make the actions (T, D) until `done`; how many were made. What is to be observed `then` comes with the answer."""
+    def advance_chunk(self, actions: NDArray[Any]) -> int:
+        """Make the actions (T, D) until `done`; how many were made."""
+        return self._advance(actions)
+
+    def advance_and_look(self, actions: NDArray[Any], cameras: Sequence[str], size: int) -> int:
+        """The same. What is to be observed next comes with the answer."""
+        return self._advance(actions, (list(cameras), size))
+
+    def _advance(self, actions: NDArray[Any], look: tuple[list[str], int] | None = None) -> int:
         self._untouched, self._seen = False, None
-        look = None if then is None else (list(then[0]), then[1])
-        answer = self._ask("advance", actions=np.asarray(actions, np.float32), then=look)
+        answer = self._ask("advance", actions=np.asarray(actions, np.float32), look=look)
         self._status = answer["status"]
         if look is not None and "observation" in answer:
             self._seen = look, answer["observation"]
