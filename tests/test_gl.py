@@ -101,7 +101,7 @@ os.waitpid(child, 0)
 
 @pytest.mark.parametrize(("backend", "says"), [("egl", "child True"), ("osmesa", "this process was forked from one that had drawn images (osmesa)")])
 def test_a_process_may_fork_after_it_drew(backend: str, says: str) -> None:
-    done = run(FORK, MUJOCO_GL=backend)
+    done = run(FORK, MUJOCO_GL=backend, OSEL_SIM_GL_CHECKED=f"{backend} MUJOCO_GL")
     assert "drawn True" in done.stdout and done.stderr == "", done.stdout + done.stderr
     assert says in done.stdout and "parent True" in done.stdout, done.stdout + done.stderr
 
@@ -149,7 +149,7 @@ if __name__ == "__main__":
 def test_gymnasiums_vector_of_processes_draws_or_says_why_not(who: str, start: str, backend: str, says: str, tmp_path: Path) -> None:
     script = tmp_path / "vector.py"
     script.write_text(VECTOR)
-    done = run(script, who, start, MUJOCO_GL=backend)
+    done = run(script, who, start, MUJOCO_GL=backend, OSEL_SIM_GL_CHECKED=f"{backend} MUJOCO_GL")
     assert says in done.stdout, done.stdout + done.stderr
 
 
