@@ -90,7 +90,8 @@ print("drawn", before.std() > 10, flush=True)
 warnings.simplefilter("ignore")  # of forking where there are threads
 child = os.fork()
 try:
-    print("child" if child == 0 else "parent", np.array_equal(before, env.reset(seed=1)[0]["image_agentview"]), flush=True)
+    same = np.array_equal(before, env.reset(seed=1)[0]["image_agentview"])
+    os.write(1, f"{'child' if child == 0 else 'parent'} {same}\\n".encode())  # in one piece, whatever the other writes meanwhile
 except DisplayError as error:
     print(str(error).partition(": start")[0], flush=True)
 if child == 0:

@@ -164,7 +164,7 @@ def test_pages_and_terminal_say_the_same_of_the_same_data(tmp_path: Path, capsys
     from rich.console import Console
 
     log = made_log(tmp_path / "log", 60)
-    flags = {"workers": 1, "no_frontier": True, "selectors": ["auto", "linucb"], "seeds": 6}
+    flags = {"workers": 1, "no_frontier": True, "selectors": ["auto", "linucb"]}
     result = replay(tmp_path / "log", alpha_time=WEIGHTS.alpha_time, alpha_price=WEIGHTS.alpha_price, out=tmp_path / "replay", **flags)
     found = result.result["verdict"]
     of_replay, of_log = replay_page(result.folder, ReplayOptions()).verdict, log_page(log, WEIGHTS).verdict
