@@ -12,6 +12,7 @@ from osel_sim.episodes.expected_costs import expected_costs
 from osel_sim.formats.policy_file import PolicySpec, Price, Remote
 from osel_sim.interface.selector import Choice
 from osel_sim.interface.specification import specification
+from osel_sim.selection.change_point import change_point
 from osel_sim.selection.features import Components, Landmarks, Sketch
 from osel_sim.selection.kernel_ucb import KernelUCBSelector
 from osel_sim.selection.registry import make_selector
@@ -374,6 +375,20 @@ def test_a_change_that_nobody_announced_is_noticed_and_what_was_before_forgotten
         late[alarm] = (play(selector, contexts, 30.0 * rewards + 5.0)[-150:] == 0).mean()
         assert (len(selector.state_dict()["targets"]) < 400) == math.isfinite(alarm)
     assert late[1e4] < 0.1 and late[math.inf] > 0.3
+
+
+@pytest.mark.parametrize("failures", [1, 2])
+def test_the_first_failures_of_a_policy_that_hardly_fails_are_no_change(failures):
+    chosen, left = np.repeat([0, 1], 80), np.repeat([0.01, 0.0], 80)
+    left[80 - failures : 80] = -7.0
+    in_turn = np.arange(160).reshape(2, 80).T.ravel()
+    assert change_point(left[in_turn], chosen[in_turn], 2, noise=0.5, alarm=1e3) == 0
+
+
+def test_many_failures_are_a_change_and_it_is_found_where_it_was():
+    generator = np.random.default_rng(0)
+    left = np.concatenate([generator.normal(size=200), generator.normal(-1.5, size=40)])
+    assert 180 <= change_point(left, np.zeros(240, np.int64), 1, noise=1.0, alarm=1e3) <= 210
 
 
 def test_where_nothing_changes_nothing_is_forgotten():

@@ -16,6 +16,11 @@ LATE = (8, 16, 32, 64, 128)
 """And so many decisions before the last, where that is finer: a change is to be seen soon after it."""
 
 
+FARTHEST = 2.0
+"""What is unexplained counts at most so many deviations. The first failure of a policy that fails once in a hundred is ten of them from the mean, and
+would by itself be a change if it were Gaussian; where success is less sure than 0.8 no failure is as far."""
+
+
 def change_point(left: Array, chosen: NDArray[np.int64], policies: int, noise: float, alarm: float) -> int:
     """How many decisions came before a change, for which the evidence exceeds `alarm`; 0 where it does not.
 
@@ -34,7 +39,7 @@ def change_point(left: Array, chosen: NDArray[np.int64], policies: int, noise: f
     # A success rate near 1 varies less than others: a policy is measured by its own noise, where that is more than the others'.
     tried = np.bincount(chosen, minlength=policies)
     own = (NOISE_WEIGHT * noise + np.bincount(chosen, left**2, policies)) / (NOISE_WEIGHT + tried)
-    scaled = left / np.sqrt(np.maximum(own, noise))[chosen]
+    scaled = np.clip(left / np.sqrt(np.maximum(own, noise))[chosen], -FARTHEST, FARTHEST)
     piece = np.searchsorted(starts, np.arange(len(chosen)), side="right")
     counts, sums = np.zeros((2, len(starts) + 1, policies))
     np.add.at(counts, (piece, chosen), 1.0)

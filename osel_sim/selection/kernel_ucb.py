@@ -65,7 +65,7 @@ class KernelUCBSelector(BayesianSelector):
         mean_chance: float = 0.4,
         floor: float = 0.1,
         least: float = 0.0,
-        alarm: float = 1e4,
+        alarm: float = 1e3,
     ) -> None:
         if components < 1 or landmarks < 1 or not width > 0.0:
             raise UsageError(f"components and landmarks must be at least 1 and width positive, got {components}, {landmarks}, {width}")
