@@ -320,9 +320,16 @@ def test_every_kind_of_panel_is_drawn(made_of_all_marks):
     (one, two), panels = records(figure.spec, figure.spec["concat"][0])[:2], figure.spec["concat"]
     assert one["y"] == [1.0, None, 2.0] and one["low"] == [0.0, None, 1.0] and two["low"] == [None] * 3
     assert panels[-1]["layer"][0]["encoding"]["x"]["scale"]["type"] == "log"
-    assert images["svg"].count(b" clip-path=") == images["svg"].count(b'_pathgroup" clip-path=') > 0  # cut off layer by layer
     shown = figure._repr_mimebundle_()  # in a notebook
     assert shown["application/vnd.vegalite.v6+json"] == figure.spec and base64.b64decode(shown["image/png"]) == images["png"]
+
+
+def test_lines_that_leave_their_panel_are_cut_off_together():
+    look = Look({"a": "c0", "b": "c1"})
+    lines = [Line("a", [0.0, 1.0, 2.0]), Line("b", [2.0, 1.0, 0.0])]
+    svg = to_images(Figure("cut", "Cut", "", "", [curves("lines", [1, 2, 3], lines, look, ("x", "y"), (0.5, 1.5))]))["svg"]
+    assert svg.count(b" clip-path=") == svg.count(b'_pathgroup" clip-path=') == 1
+    assert svg.count(b"_marks") > 2
 
 
 @pytest.mark.parametrize("kind", ["log", "replay", "run"])
