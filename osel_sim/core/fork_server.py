@@ -50,13 +50,16 @@ class Forked:
             if self._code is None:  # the server was killed, and nobody tells
                 self.kill()
                 self._code = -signal.SIGKILL
-            self._status.close()
         return self._code
 
     def kill(self) -> None:
         """Kill it, unless it has ended."""
         self._know_pid()
-        if self._pid is not None and self._code is None:
+        if self._pid is None or self._code is not None:
+            return
+        if self._status.poll(0.0):  # it has ended, and its id may be another's by now; or the server has
+            self._code = self._told()
+        if self._code is None:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self._pid, signal.SIGKILL)
 
