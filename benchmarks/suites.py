@@ -1,11 +1,11 @@
 """How much quicker than stock Meta-World: one picture, one episode with pictures; and what a process of its own costs.
 
     python -m osel_sim.suites install metaworld
-    python benchmarks/suites.py [--task drawer-open-v3] [--rounds 5] [--steps 80] [--size 128]
+    python benchmarks/suites.py [--parts frame episode hosted] [--task drawer-open-v3] [--rounds 5] [--steps 80] [--size 128]
 
 Stock is what Meta-World's and LeRobot's users have: `metaworld`'s environment with `render_mode="rgb_array"`, a picture after every step. Ours looks
 at every 8th step, since policies answer in chunks. Both run alternately on the same packages in this one process, with the same actions; figures are
-medians over the rounds. `hosted` is the same episode of ours in a host process.
+medians over the rounds. `hosted` is the same episode of ours in a host process: the median over 20 pairs a round, one here and one there in turn.
 The last line is JSON: metaworld_frame_ratio, metaworld_episode_ratio, hosted_slowdown (1.1: 10% slower than in this process).
 """
 
@@ -26,7 +26,8 @@ from osel_sim.suites.hosted import HostedEnvironment, host_of
 from osel_sim.suites.registry import find_task
 
 CAMERA, EVERY = "corner2", 8
-PAIRS = 4
+PARTS = ("frame", "episode", "hosted")
+PAIRS = 20
 """Episodes of ours and of the host a round."""
 
 
@@ -61,23 +62,30 @@ def stock_episode(env: Any, actions: np.ndarray) -> None:
 
 def our_episode(env: Environment, instance: Any, actions: np.ndarray, size: int) -> None:
     env.load(instance)
+    look = [CAMERA], size
     for start in range(0, len(actions), EVERY):
-        env.observe([CAMERA], size)
+        env.observe(*look)
         chunk = actions[start : start + EVERY]
-        if isinstance(env, HostedEnvironment):
-            env.advance_chunk(chunk)
+        if isinstance(env, HostedEnvironment):  # as the episode loop does
+            if start + EVERY < len(actions):
+                env.advance_and_look(chunk, *look)
+            else:
+                env.advance_chunk(chunk)
         else:
             for action in chunk:
                 env.advance(action)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--task", default="drawer-open-v3")
-    parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=80)
-    parser.add_argument("--size", type=int, default=128)
-    options = parser.parse_args()
+def pair(here: Callable[[], Any], there: Callable[[], Any], here_first: bool) -> tuple[float, float]:
+    """Seconds here and there, one after the other."""
+    if here_first:
+        return seconds(here), seconds(there)
+    later = seconds(there)
+    return seconds(here), later
+
+
+def measure(options: argparse.Namespace) -> tuple[dict[str, list[float]], list[tuple[float, float]]]:
+    """Seconds of each kind, and of pairs of episodes here and in the host."""
     place = environment("metaworld")
     place.require("metaworld")
     choose_backend()
@@ -88,26 +96,47 @@ def main() -> None:
     # Actions at random do nothing in particular, and so never end the episode early.
     actions = np.random.default_rng(0).uniform(-1, 1, (options.steps, 4)).astype(np.float32)
     for env in (ours, hosted):
-        env.load(instance)
-        env.image(CAMERA, options.size, options.size)
+        our_episode(env, instance, actions, options.size)
     stock.reset()
     stock_picture(stock)
-    found: dict[str, list[float]] = {name: [] for name in ("stock frame", "our frame", "stock episode", "our episode", "hosted episode")}
+    found: dict[str, list[float]] = {}
+    pairs: list[tuple[float, float]] = []
+
+    def time_of(name: str, function: Callable[[], Any]) -> None:
+        found.setdefault(name, []).append(seconds(function))
+
     for _ in range(options.rounds):
-        found["stock frame"].append(seconds(lambda: stock_picture(stock)))
-        found["our frame"].append(seconds(lambda: ours.image(CAMERA, options.size, options.size)))
-        found["stock episode"].append(seconds(lambda: stock_episode(stock, actions)))
-        for _ in range(PAIRS):  # short, and next to each other: what else the machine does meets both
-            found["our episode"].append(seconds(lambda: our_episode(ours, instance, actions, options.size)))
-            found["hosted episode"].append(seconds(lambda: our_episode(hosted, instance, actions, options.size)))
+        if "frame" in options.parts:
+            time_of("stock frame", lambda: stock_picture(stock))
+            time_of("our frame", lambda: ours.image(CAMERA, options.size, options.size))
+        if "episode" in options.parts:
+            time_of("stock episode", lambda: stock_episode(stock, actions))
+            time_of("our episode", lambda: our_episode(ours, instance, actions, options.size))
+        if "hosted" in options.parts:  # short, next to each other and in turn: what else the machine does meets both
+            here, there = ((lambda env=env: our_episode(env, instance, actions, options.size)) for env in (ours, hosted))
+            pairs += [pair(here, there, number % 2 == 0) for number in range(PAIRS)]
+    return found, pairs
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--task", default="drawer-open-v3")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--steps", type=int, default=80)
+    parser.add_argument("--size", type=int, default=128)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to measure (default: all)")
+    options = parser.parse_args()
+    found, pairs = measure(options)
     median = {name: statistics.median(values) for name, values in found.items()}
     for name, value in median.items():
         print(f"{name:15} {1e3 * value:9.1f} ms")
-    ratios = {
-        "metaworld_frame_ratio": median["stock frame"] / median["our frame"],
-        "metaworld_episode_ratio": median["stock episode"] / median["our episode"],
-        "hosted_slowdown": statistics.median(there / here for there, here in zip(found["hosted episode"], found["our episode"], strict=True)),
-    }
+    ratios = {f"metaworld_{part}_ratio": median[f"stock {part}"] / median[f"our {part}"] for part in ("frame", "episode") if part in options.parts}
+    if pairs:
+        for name, times in zip(("episode here", "episode in host"), zip(*pairs, strict=True), strict=True):
+            print(f"{name:15} {1e3 * statistics.median(times):9.1f} ms")
+        lower, middle, upper = statistics.quantiles((there / here for here, there in pairs), n=4)
+        print(f"{len(pairs)} pairs: {middle:.3f} times as long in the host, half of them {lower:.2f} to {upper:.2f}")
+        ratios["hosted_slowdown"] = middle
     print(json.dumps({name: round(value, 2) for name, value in ratios.items()}))
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from osel_sim.suites.environments import environment
+
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
 
@@ -20,11 +22,22 @@ def test_none_hides_a_package():
     assert names and others == []
 
 
+def figures(script: str, *arguments: str) -> dict[str, float]:
+    """The last line that a benchmark prints."""
+    command = [sys.executable, str(BENCHMARKS / script), *arguments]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(BENCHMARKS.parent)}, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 @pytest.mark.slow
 def test_replays_are_measured():
     arguments = ["--parts", "ppo", "bound", "--dim", "16", "--decisions", "15", "--seeds", "1", "--sb3-seeds", "1", "--workers", "1"]
-    command = [sys.executable, str(BENCHMARKS / "replay.py"), *arguments]
-    environment = {**os.environ, "PYTHONPATH": str(BENCHMARKS.parent)}
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-    figures = json.loads(done.stdout.splitlines()[-1])
-    assert figures["ratio_one_thread"] > 1.0 and 0.0 < figures["memory_ms"] < figures["epoch_ms"]
+    measured = figures("replay.py", *arguments)
+    assert measured["ratio_one_thread"] > 1.0 and 0.0 < measured["memory_ms"] < measured["epoch_ms"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not environment("metaworld").installed, reason="the suite's environment has not been made")
+def test_hosts_are_measured():
+    measured = figures("suites.py", "--parts", "frame", "hosted", "--rounds", "1", "--steps", "16")
+    assert measured.keys() == {"metaworld_frame_ratio", "hosted_slowdown"} and measured["metaworld_frame_ratio"] > 5.0

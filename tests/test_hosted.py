@@ -1,20 +1,25 @@
 """Environments in a host process: what is asked arrives, and whatever a host does, nobody waits for ever or takes one answer for another."""
 
 import contextlib
+import math
 import os
 import signal
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import toy_host
+from test_episode import spec
 from toy_host import DIE, FAIL, HANG, Point
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect as stock_connect
 
 from osel_sim.core.errors import SuiteHostError, UsageError
+from osel_sim.episodes.loop import Driver, run_episode
+from osel_sim.interface.call import Call
 from osel_sim.remote.codec import ProtocolError, pack, unpack
 from osel_sim.suites import hosted
 from osel_sim.suites.base import PlainInstance
@@ -30,6 +35,11 @@ class ToyHost(Host):
     def __init__(self, manners: str = "good") -> None:
         super().__init__("toy", SuiteEnvironment("gym"))
         self.manners = manners
+        self.asked: list[str] = []
+
+    def ask(self, message, life=None):
+        self.asked.append(message["do"])
+        return super().ask(message, life)
 
     def command(self, ready: int) -> list[str]:
         return [sys.executable, toy_host.__file__, str(ready), self.manners]
@@ -64,6 +74,73 @@ def test_it_is_the_environment_of_this_process_to_the_byte(env):
         assert there.keys() == expected.keys() and all(np.array_equal(there[key], expected[key]) for key in expected)
         assert env.steps == here.steps and env.done == here.done
         there["observation.images.top"][0] = 0  # its own, and not what came over the wire
+
+
+def test_what_is_to_be_looked_at_next_comes_with_the_chunk(env, host):
+    here = Point()
+    here.load(INSTANCE)
+
+    def both(*values: float, look=None):
+        assert (env.advance_and_look(chunk(*values), *look) if look else env.advance_chunk(chunk(*values))) == len(values)
+        for action in chunk(*values):
+            here.advance(action)
+
+    def same(cameras, size: int):
+        there, expected = env.observe(cameras, size), here.observe(cameras, size)
+        there["observation.state"][:] += 0  # its own
+        return all(np.array_equal(there[key], expected[key]) for key in expected)
+
+    both(0.5, 0.25, look=(("top",), 32))
+    host.asked.clear()
+    assert same(["top"], 32) and same(("top",), 32) and host.asked == []
+    assert same(["top"], 16) and same([], 32) and host.asked == ["observe"] * 2, "something else is asked for"
+    both(-0.5)
+    assert same(["top"], 32), "what was seen before the last chunk is not shown again"
+    both(0.125, look=(("top",), 32))
+    for world in (here, env):
+        world.load(INSTANCE)
+    assert same(["top"], 32), "nor before a reset"
+
+
+class Still:
+    """A policy that stays where it is, in chunks of eight."""
+
+    def reset(self, instruction, seed):
+        self.seen = []
+
+    def call(self, observation):
+        self.seen.append(observation)
+        return Call(np.zeros((8, 1), np.float32))
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("execute", [8, 1])
+def test_an_episode_asks_once_a_chunk_and_sees_what_it_sees_in_this_process(execute, env, host):
+    driver = Driver(replace(spec("still", execute=execute), cameras=("top",)), Still())
+    host.asked.clear()
+    outcome = run_episode(env, INSTANCE, driver)
+    assert host.asked == ["observe"] + ["advance"] * math.ceil(100 / execute)
+    there, here = driver.caller.seen, Point()
+    here.load(INSTANCE)
+    assert run_episode(here, INSTANCE, driver) == outcome and len(there) == len(driver.caller.seen)
+    for one, other in zip(there, driver.caller.seen, strict=True):
+        assert all(np.array_equal(one[key], other[key]) for key in other)
+
+
+def test_an_episode_that_is_over_draws_nothing_more(env, host):
+    left = env.specification.horizon - env.steps
+    assert env.advance_and_look(chunk(*[0.0] * (left + 5)), ["top"], 32) == left and env.done
+    host.asked.clear()
+    env.observe(["top"], 32)
+    assert host.asked == ["observe"]
+
+
+def test_what_cannot_be_shown_is_told_to_whoever_looks(env):
+    assert env.advance_and_look(chunk(0.5), ["no such camera"], -1) == 1 and env.steps == 1
+    with pytest.raises(SuiteHostError, match="the host of suite 'toy'"):
+        env.observe(["no such camera"], -1)
 
 
 def test_it_needs_no_threads_and_leaves_no_process_behind(host):

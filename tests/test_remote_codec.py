@@ -38,6 +38,13 @@ def test_every_allowed_dtype_survives(dtype):
     assert unpack(pack(array[0, 1])) == array[0, 1]
 
 
+def test_a_message_stays_what_it_is_when_the_frame_is_overwritten():
+    frame = bytearray(pack(MESSAGE))
+    message = unpack(memoryview(frame))
+    frame[:] = bytes(len(frame))
+    assert same(message, MESSAGE)
+
+
 def test_a_non_contiguous_array_keeps_its_meaning():
     array = np.arange(24, dtype=np.float32).reshape(4, 6)
     for view in (array[::2, ::-1].T, array.T, np.asfortranarray(array)):

@@ -25,7 +25,7 @@ from osel_sim.episodes.driver import Tally, monitor_seed
 from osel_sim.episodes.driver import episode_seed as episode_seed
 from osel_sim.episodes.handoffs import Answer, Course, Handoffs, Watch, decided, difference
 from osel_sim.interface.call import Call, Privileged
-from osel_sim.interface.environment import ActionSpec, Environment, TakesChunks
+from osel_sim.interface.environment import ActionSpec, Environment, LooksAhead, TakesChunks
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.monitor import DecisionPoint, Turn
 from osel_sim.interface.outcome import Outcome, Seconds
@@ -219,7 +219,7 @@ class Episode:
                 return call.failure
             self.tallies[-1].paid_per_action = call.paid_per_action  # only now: what was made while waiting is of the answer before
             stop = max(made, driver.spec.execute)
-            self._make(call.actions[made:stop])
+            self._make(call.actions[made:stop], then_look=True)
             self.rest, self.planner = call.actions[stop:], len(self.tallies) - 1
         return None
 
@@ -298,11 +298,15 @@ class Episode:
         self._hold(steps - made)
         return made
 
-    def _make(self, actions: Actions, planner: int = -1) -> int:
+    def _make(self, actions: Actions, planner: int = -1, then_look: bool = False) -> int:
         """Make the actions (T, D) of a policy, an index of the tallies, until the episode is over. Returns how many were made."""
         unseen = len(actions) - (self.history.length - 1)
-        if self.chunked is not None and unseen > 1 and not self.env.done:
-            made = self.chunked.advance_chunk(np.stack([self.noise(action) for action in actions[:unseen]]))
+        if self.chunked is not None and unseen > 0 and not self.env.done:
+            chunk, spec = np.stack([self.noise(action) for action in actions[:unseen]]), self.tallies[-1].spec
+            if isinstance(self.chunked, LooksAhead) and (then_look or unseen < len(actions)):
+                made = self.chunked.advance_and_look(chunk, spec.cameras, spec.image_size)
+            else:
+                made = self.chunked.advance_chunk(chunk)
             self.tallies[planner].made(made)
             return made if made < unseen or unseen == len(actions) else made + self._make(actions[unseen:], planner)
         for made, action in enumerate(actions):

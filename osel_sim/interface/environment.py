@@ -223,6 +223,15 @@ class TakesChunks(Protocol):
         ...
 
 
+@runtime_checkable
+class LooksAhead(TakesChunks, Protocol):
+    """An environment that can look at once where a chunk ends, so that what is seen there need not be asked for."""
+
+    def advance_and_look(self, actions: NDArray[Any], cameras: Sequence[str], size: int) -> int:
+        """As `advance_chunk`. Unless the episode is over, `observe` will be asked for these cameras in this size next."""
+        ...
+
+
 class Expert(Protocol):
     """A scripted expert that sees the simulator's state."""
 

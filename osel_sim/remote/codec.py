@@ -13,7 +13,8 @@ import numpy as np
 
 from osel_sim.core.errors import RemoteError
 
-DTYPES = frozenset({"|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8"})
+DTYPES = {name: np.dtype(name) for name in ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8")}
+NAMES = {dtype: name for name, dtype in DTYPES.items()}
 MAX_DIMENSIONS = 8
 MAX_ITEMS = 4096  # of a list or map; numbers in bulk travel as arrays
 MAX_STRING = 1 << 16
@@ -37,7 +38,7 @@ def pack(message: Any) -> bytes:
 
 
 def unpack(frame: bytes | memoryview) -> Any:
-    """The message of one frame. Its arrays are read-only views of the frame.
+    """The message of one frame. Its arrays are read-only, and share no memory with the frame.
 
     Raises:
         ProtocolError: saying what is wrong with it.
@@ -59,14 +60,15 @@ def unpack(frame: bytes | memoryview) -> Any:
 
 
 def _to_wire(value: Any) -> dict[bytes, Any]:
-    if not isinstance(value, np.ndarray | np.generic):
+    if not isinstance(value, (np.ndarray, np.generic)):
         raise TypeError(f"{type(value).__name__} has no wire form")
-    if value.dtype.str not in DTYPES:
+    name = NAMES.get(value.dtype)
+    if name is None:
         raise TypeError(f"dtype {value.dtype} has no wire form")
     if isinstance(value, np.ndarray):
         data = value.data if value.flags.c_contiguous else value.tobytes()
-        return {b"__ndarray__": True, b"data": data, b"dtype": value.dtype.str, b"shape": value.shape}
-    return {b"__npgeneric__": True, b"data": value.item(), b"dtype": value.dtype.str}
+        return {b"__ndarray__": True, b"data": data, b"dtype": name, b"shape": value.shape}
+    return {b"__npgeneric__": True, b"data": value.item(), b"dtype": name}
 
 
 def _from_wire(value: dict[Any, Any]) -> Any:
@@ -85,14 +87,14 @@ def _dtype(value: dict[Any, Any]) -> np.dtype[Any]:
     name = value.get(b"dtype")
     if not isinstance(name, str) or name not in DTYPES:
         raise ProtocolError(f"dtype {str(name)[:40]!r} is not allowed; allowed: {', '.join(sorted(DTYPES))}")
-    return np.dtype(name)
+    return DTYPES[name]
 
 
 def _array(dtype: np.dtype[Any], data: Any, shape: Any) -> np.ndarray[Any, Any]:
     if not isinstance(data, bytes):
         raise ProtocolError(f"an array's data must be bytes, got {type(data).__name__}")
-    if not isinstance(shape, list | tuple) or len(shape) > MAX_DIMENSIONS or not all(type(size) is int and 0 <= size < 1 << 31 for size in shape):
+    if type(shape) is not list or len(shape) > MAX_DIMENSIONS or not all([type(size) is int and 0 <= size < 1 << 31 for size in shape]):
         raise ProtocolError(f"an array's shape must be at most {MAX_DIMENSIONS} non-negative integers, got {str(shape)[:60]}")
     if math.prod(shape) * dtype.itemsize != len(data):
         raise ProtocolError(f"an array of shape {tuple(shape)} and dtype {dtype.str} has {math.prod(shape) * dtype.itemsize} bytes, got {len(data)}")
-    return np.frombuffer(data, dtype=dtype).reshape(shape)
+    return np.ndarray(shape, dtype, data)

@@ -57,7 +57,8 @@ class Table:
             "load": self._load,
             "observe": lambda env, message: {"observation": env.observe(message["cameras"], message["size"])},
             "image": lambda env, message: {"image": env.image(message["camera"], message["width"], message["height"], message["quality"])},
-            "advance": lambda env, message: {"made": advance_chunk(env, message["actions"]), "status": status(env)},
+            "advance": self._advance,
+            "hold": lambda env, message: {"action": env.hold_action()},
             "scene": lambda env, message: {"scene": env.scene_digest() if isinstance(env, TellsScene) else ""},
             "snapshot": lambda env, message: {"snapshot": env.snapshot()},
             "restore": self._restore,
@@ -97,6 +98,13 @@ class Table:
         env.load(PlainInstance(**message["instance"]))
         return {"status": status(env)}
 
+    def _advance(self, env: Environment, message: Message) -> Message:
+        answer = {"made": advance_chunk(env, message["actions"]), "status": status(env)}
+        if message["look"] is not None and not env.done:
+            with contextlib.suppress(Exception):  # told to whoever asks for it
+                answer["observation"] = env.observe(*message["look"])
+        return answer
+
     def _restore(self, env: Environment, message: Message) -> Message:
         env.restore(message["snapshot"])
         return {"status": status(env)}
@@ -126,7 +134,6 @@ def status(env: Environment) -> Message:
         "success": bool(env.success),
         "subgoals": float(env.subgoal_fraction),
         "done": bool(env.done),
-        "hold": env.hold_action(),
     }
 
 

@@ -1,7 +1,8 @@
 """Environments that run in a host process, in their suite's own Python environment, as environments of this process.
 
-A chunk of actions goes over at once, images come when they are asked for, and what the episode loop asks after every step (steps, success, whether it
-is over) is known here. A host that has ended is an error of the episode under way, and the next one has a fresh host: nobody else notices.
+A chunk of actions goes over at once. Images come when they are asked for, or with the answer to a chunk that says what is looked at next. What the
+episode loop asks after every step (steps, success, whether it is over) is known here. A host that has ended is an error of the episode under way,
+and the next one has a fresh host: nobody else notices.
 """
 
 import atexit
@@ -135,7 +136,7 @@ def host_of(suite: str, where: str) -> Host:
 
 
 class HostedEnvironment:
-    """An environment of a host process, and an `Environment` and `TakesChunks` of this one.
+    """An environment of a host process, and an `Environment` and `LooksAhead` of this one.
 
     Args:
         host: where it runs.
@@ -146,6 +147,7 @@ class HostedEnvironment:
         self._host, self._task = host, task
         self._instance: PlainInstance | None = None
         self._status: Message = {}
+        self._seen: tuple[tuple[list[str], int], Message] | None = None
         self._closed = False
         self._open()
 
@@ -182,7 +184,7 @@ class HostedEnvironment:
     def load(self, instance: PlainInstance) -> None:
         """Reset to an instance, in a fresh host where the last one has ended."""
         self._instance = instance
-        self._untouched = True
+        self._untouched, self._seen = True, None
         self._status = self._ask("load", instance=dataclasses.asdict(instance))["status"]
 
     def advance(self, action: NDArray[Any]) -> None:
@@ -191,19 +193,32 @@ class HostedEnvironment:
 
     def advance_chunk(self, actions: NDArray[Any]) -> int:
         """Make the actions (T, D) until `done`; how many were made."""
-        self._untouched = False
-        answer = self._ask("advance", actions=np.asarray(actions, np.float32))
+        return self._advance(actions)
+
+    def advance_and_look(self, actions: NDArray[Any], cameras: Sequence[str], size: int) -> int:
+        """The same. What is to be observed next comes with the answer."""
+        return self._advance(actions, (list(cameras), size))
+
+    def _advance(self, actions: NDArray[Any], look: tuple[list[str], int] | None = None) -> int:
+        self._untouched, self._seen = False, None
+        answer = self._ask("advance", actions=np.asarray(actions, np.float32), look=look)
         self._status = answer["status"]
+        if look is not None and "observation" in answer:
+            self._seen = look, answer["observation"]
         return int(answer["made"])
 
     def observe(self, cameras: Sequence[str], size: int) -> Observation:
         """What a policy is shown now."""
-        observation = self._ask("observe", cameras=list(cameras), size=size)["observation"]
+        look = list(cameras), size
+        if self._seen is not None and self._seen[0] == look:
+            observation = self._seen[1]
+        else:
+            observation = self._ask("observe", cameras=look[0], size=size)["observation"]
         return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in observation.items()}
 
     def hold_action(self) -> Actions:
         """The action (D,) that holds still."""
-        return np.array(self._status["hold"], np.float32)
+        return np.array(self._ask("hold")["action"], np.float32)
 
     def image(self, camera: str, width: int, height: int, quality: str = "fast") -> Image:
         """Image (height, width, 3) of a camera."""
@@ -220,7 +235,7 @@ class HostedEnvironment:
     def restore(self, snapshot: Any) -> None:
         """Back to a snapshot, in a fresh host where the last one has ended."""
         self._instance, status, state = snapshot
-        self._untouched = True
+        self._untouched, self._seen = True, None
         self._status = self._ask("restore", snapshot=state)["status"]
         self._untouched = status["steps"] == 0
 
@@ -254,7 +269,7 @@ class HostedEnvironment:
         self._number, self._life = int(answer["env"]), self._host.life
         self._specification = EnvironmentSpec.from_dict(answer["specification"])
         self._landmark_names = tuple(answer["landmarks"])
-        self._status = {"steps": 0, "success": False, "subgoals": 0.0, "done": False, "hold": []}
+        self._status = {"steps": 0, "success": False, "subgoals": 0.0, "done": False}
         self._untouched = True
 
     def _ask(self, do: str, **arguments: Any) -> Message:
