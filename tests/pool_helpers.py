@@ -3,6 +3,7 @@
 import itertools
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -66,3 +67,47 @@ def sleep_long():
     Path(os.environ["STARTED"]).mkdir(exist_ok=True)
     (Path(os.environ["STARTED"]) / str(os.getpid())).touch()
     time.sleep(600)
+
+
+def look_around():
+    """What a worker's surroundings are: a variable, the folder, a module of the path, its command line and a random number; and it speaks."""
+
+    def work(job, start):
+        import numpy as np
+        from only_here import NUMBER
+
+        print(f"out {job}", flush=True)
+        print(f"err {job}", file=sys.stderr, flush=True)
+        return [(os.environ["SEEN"], os.getcwd(), NUMBER, sys.argv[1:], float(np.random.random()))]
+
+    return work
+
+
+def blas_threads():
+    """Threads that numpy computes with."""
+
+    def work(job, start):
+        import numpy  # noqa: F401
+        from threadpoolctl import threadpool_info
+
+        return [max(pool["num_threads"] for pool in threadpool_info() if pool["internal_api"] == "openblas")]
+
+    return work
+
+
+def slow_squares():
+    """Two results a job, after a little while each, with the process that started this one."""
+    parent = os.getppid()
+
+    def work(job, start):
+        for value in [job, job * job][start:]:
+            yield parent, value
+            time.sleep(0.2)
+
+    return work
+
+
+def forked_from():
+    """Threads of the process that started this one, and modules that were imported there."""
+    found = len(os.listdir(f"/proc/{os.getppid()}/task")), set(sys.modules)
+    return lambda job, start: [found]

@@ -1,5 +1,6 @@
 """A plugin package with two small deterministic policies, and a short task, for tests of the commands in processes of their own."""
 
+import contextlib
 import os
 import re
 import shlex
@@ -170,7 +171,19 @@ def wait_for_lines(process: subprocess.Popen, file: Path, lines: int) -> None:
 
 def children(process: subprocess.Popen) -> set[int]:
     """Process ids of what a process started from its main thread and has not buried."""
-    return set(map(int, Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()))
+    return _children(process.pid)
+
+
+def _children(pid: int) -> set[int]:
+    with contextlib.suppress(FileNotFoundError):  # it has ended
+        return set(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
+    return set()
+
+
+def started(process: subprocess.Popen) -> set[int]:
+    """Process ids of those, and of what they started themselves."""
+    direct = children(process)
+    return direct.union(*(_children(pid) for pid in direct))
 
 
 def wait_until(condition: Callable[[], object], seconds: float) -> bool:

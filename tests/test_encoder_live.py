@@ -298,7 +298,7 @@ def test_a_selector_that_is_told_again_knows_what_it_was_told(name):
     chance = np.random.default_rng(0)
     decisions, groups = made_up(200, chance, error=0.05)
     contexts = list(np.eye(4, dtype=np.float32)[groups])
-    selector, fresh = (make_selector(name, ["a", "b"], 4, seed) for seed in (1, 1))
+    selector, fresh = (make_selector(name, ["a", "b"], 4, seed, **({"layers": (16,)} if name == "ppo" else {})) for seed in (1, 1))
 
     def learn(context, choice, decision):
         assert choice.propensities == decision.propensities

@@ -33,20 +33,20 @@ def log(tmp_path_factory) -> Path:
 
 
 def test_what_sharing_is_worth_does_not_depend_on_workers_and_is_shown(log, tmp_path):
-    settings = {"selectors": ["linucb", "thompson"], "seeds": 2, "decisions": 120, "robots": 4, "share": "every:5", **FREE}
+    settings = {"selectors": ["linucb", "thompson"], "seeds": 2, "decisions": 60, "robots": 4, "share": "every:5", **FREE}
     results = [osel.replay(log, workers=workers, out=tmp_path / str(workers), **settings).result for workers in (1, 2)]
     assert (tmp_path / "1" / "replay.json").read_bytes() == (tmp_path / "2" / "replay.json").read_bytes()
     sharing = results[0]["sharing"]
-    assert (sharing["robots"], sharing["share"], sharing["decisions"], sharing["by"], sharing["delay"]) == (4, "every:5", 30, None, 0)
+    assert (sharing["robots"], sharing["share"], sharing["decisions"], sharing["by"], sharing["delay"]) == (4, "every:5", 15, None, 0)
     entry = sharing["selectors"]["thompson"]
     assert list(entry["ways"]) == ["none", "every:5", "all"]
     assert entry["message_bytes"] == 16 * 3 + 8
     assert entry["gain"] == pytest.approx(entry["ways"]["all"]["mean_reward"] - entry["ways"]["none"]["mean_reward"])
-    assert len(entry["ways"]["all"]["curve"]) == len(sharing["at"]) == 30
+    assert len(entry["ways"]["all"]["curve"]) == len(sharing["at"]) == 15
     assert sharing["selectors"]["linucb"]["message_bytes"] == 5 * (4 * 6 + 8 + 16)
     console = SafeConsole(width=200, record=True)
     print_sharing(console, sharing)
-    assert "4 robots, 30 decisions each, dealt out in turn" in console.export_text()
+    assert "4 robots, 15 decisions each, dealt out in turn" in console.export_text()
     page = osel.report(tmp_path / "1").page.read_text()
     assert "Robots that share" in page and "closed by sharing" in page
 

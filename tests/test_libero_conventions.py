@@ -44,8 +44,8 @@ def moments() -> Iterator[list[tuple[dict[str, Any], dict[str, Any]]]]:
     )
     random, found = np.random.default_rng(0), []
     raw, action = env.reset(), np.zeros(7)
-    for step in range(40):
-        if step % 8 == 0:
+    for step in range(20):
+        if step % 4 == 0:
             action = random.uniform(-1, 1, 7) * [0.3, 0.3, 0.3, 1, 1, 1, 1]
             site, quaternion = env.sim.data.site_xmat[env.robots[0].eef_site_id["right"]], np.empty(4)
             mujoco.mju_mat2Quat(quaternion, site.reshape(-1))

@@ -11,6 +11,7 @@ from osel_sim.analysis.gains import Gain, gain_of
 from osel_sim.analysis.log import LoggedInstance, LoggedOutcomes, read_log
 from osel_sim.analysis.measures import Curves, difference_ends, gap_closed
 from osel_sim.analysis.oracles import expected_oracle, oracles
+from osel_sim.analysis.remembered import fingerprint
 from osel_sim.analysis.streams import complete_instances, draw_streams
 from osel_sim.core.errors import DataError, UsageError
 from osel_sim.selection.reward import RewardWeights
@@ -34,6 +35,17 @@ def test_order_and_truth(tmp_path: Path):
     assert log.mean_rewards(FREE)[:, found.best_single].mean() == pytest.approx(made.best_single, abs=0.02)
     for few in (1, 2, 3):  # as in a run that has just begun: halves may be empty
         assert np.isfinite(oracles(log.take(np.arange(few)), FREE).predictable).all()
+
+
+def test_what_was_computed_of_a_log_is_remembered_until_anything_in_it_differs(tmp_path: Path):
+    log = read_log(clusters(tmp_path / "log", instances=60, clusters=3, dim=4, policies=2).folder)
+    found = oracles(log, FREE)
+    assert oracles(replace(log, source=tmp_path), FREE) is found
+    other = replace(log, success=np.where(np.arange(60)[:, None, None] == 7, 1.0 - log.success, log.success))
+    moved, turned = replace(log, contexts=log.contexts + 1), log.take(np.arange(60)[::-1])
+    for changed in (other, moved, turned, log.only(log.policies[::-1])):
+        assert fingerprint(changed) != fingerprint(log) and oracles(changed, FREE) is not found
+    assert oracles(log, RewardWeights(0.1, 0.0)) is not found and oracles(log, FREE) is found
 
 
 def test_luck_is_not_foresight():

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from remote_helpers import alive
-from run_helpers import HORIZON, children, command, environment, execute, next_commands, wait_for_lines, wait_until
+from run_helpers import HORIZON, children, command, environment, execute, next_commands, started, wait_for_lines, wait_until
 
 from osel_sim.analysis.log import read_log
 from osel_sim.api.report import report
@@ -249,7 +249,7 @@ def test_a_worker_that_is_killed_costs_nothing(world, reference):
     arguments = command(world, "record", *SIZE, "--workers", 1, "--out", folder)
     process = subprocess.Popen(arguments, env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     wait_for_lines(process, folder / "shards.jsonl", 2)
-    (worker,) = children(process)
+    (worker,) = started(process) - children(process)
     os.kill(worker, signal.SIGKILL)
     complaints = process.communicate(timeout=600)[1]
     assert process.returncode == 0 and "lost" not in complaints
@@ -276,9 +276,9 @@ def test_a_recording_killed_while_its_workers_start_leaves_no_process(world):
     folder = world / "young"
     arguments = command(world, "record", *SIZE, "--workers", 2, "--out", folder)
     process = subprocess.Popen(arguments, env=environment(world), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    assert wait_until(lambda: len(children(process)) == 2, 120)
-    workers = children(process)
-    time.sleep(0.5)  # they import what records episodes
+    assert wait_until(lambda: len(started(process)) == 3, 120)  # two, and what forked them
+    workers = started(process)
+    time.sleep(0.5)  # they load what records episodes
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert wait_until(lambda: not any(map(alive, workers)), 10)

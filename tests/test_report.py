@@ -324,6 +324,14 @@ def test_every_kind_of_panel_is_drawn(made_of_all_marks):
     assert shown["application/vnd.vegalite.v6+json"] == figure.spec and base64.b64decode(shown["image/png"]) == images["png"]
 
 
+def test_lines_that_leave_their_panel_are_cut_off_together():
+    look = Look({"a": "c0", "b": "c1"})
+    lines = [Line("a", [0.0, 1.0, 2.0]), Line("b", [2.0, 1.0, 0.0])]
+    svg = to_images(Figure("cut", "Cut", "", "", [curves("lines", [1, 2, 3], lines, look, ("x", "y"), (0.5, 1.5))]))["svg"]
+    assert svg.count(b" clip-path=") == svg.count(b'_pathgroup" clip-path=') == 1
+    assert svg.count(b"_marks") > 2
+
+
 @pytest.mark.parametrize("kind", ["log", "replay", "run"])
 def test_every_figure_keeps_to_the_schema_is_not_blank_and_says_what_it_shows(all_pages, kind):
     page, folder = all_pages[kind]

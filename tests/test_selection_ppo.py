@@ -85,14 +85,14 @@ def sb3(contexts, rewards, decisions: int, batch_size: int, layers) -> PPO:
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
 @pytest.mark.parametrize("batch_size", [5, 64], ids=["batch of 5", "SB3's default batch"])
 def test_same_weights_as_learn(batch_size):
-    contexts, rewards, _ = problem(0, 60)
-    reference = sb3(contexts, rewards, 60, batch_size, (768, 512, 128, 64, 16))
+    contexts, rewards, _ = problem(0, 30)
+    reference = sb3(contexts, rewards, 30, batch_size, (768, 512, 128, 64, 16))
     selector = PPOSelector(POLICIES, 32, seed=7)
     untrained = weights(selector)
     play(selector, contexts, rewards)
     assert same(weights(selector), list(reference.policy.state_dict().values()))
     assert not same(weights(selector), untrained)
-    assert selector.algorithm.num_timesteps == reference.num_timesteps == 60
+    assert selector.algorithm.num_timesteps == reference.num_timesteps == 30
     assert selector.algorithm._n_updates == reference._n_updates
 
 

@@ -17,6 +17,7 @@ from remote_helpers import ENVIRONMENT, TOKEN, install_plugin, observation, poli
 
 from osel_sim.core.errors import RemoteError
 from osel_sim.remote.client import RemoteClient
+from osel_sim.serve import main
 
 COMMAND = [sys.executable, "-m", "osel_sim.serve"]
 
@@ -117,15 +118,20 @@ def test_stops_in_time_even_when_the_policy_never_answers(folder):
         (["wrong"], r"wrong\.toml: execute: must lie in"),
     ],
 )
-def test_wrong_input_gets_one_line_and_exit_code_2(folder, arguments, complaint):
+def test_wrong_input_gets_one_line_and_exit_code_2(folder, arguments, complaint, monkeypatch, capsys):
+    """In this process; `test_a_used_port` is of a process of its own."""
+    monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.delenv("OSEL_SIM_TOKEN", raising=False)
+    for name, token in (("SHORT_TOKEN", "abc"), ("GOOD_TOKEN", TOKEN)):
+        monkeypatch.setenv(name, token)
     (folder / "wrong.toml").write_text(
         (folder / "sinusoid.toml").read_text().replace("execute = 4", "execute = 0").replace('"sinusoid"', '"wrong"', 1)
     )
-    result = run(folder, *arguments, "--policies-dir", str(folder), SHORT_TOKEN="abc", GOOD_TOKEN=TOKEN)
-    assert result.returncode == 2, result.stderr
-    assert result.stderr.startswith("error: ") and result.stderr.count("\n") == 1, result.stderr
-    assert re.search(complaint, result.stderr)
-    assert result.stdout == ""
+    code, shown = main([*arguments, "--policies-dir", str(folder)]), capsys.readouterr()
+    assert code == 2, shown.err
+    assert shown.err.startswith("error: ") and shown.err.count("\n") == 1, shown.err
+    assert re.search(complaint, shown.err)
+    assert shown.out == ""
 
 
 def test_a_used_port(folder):

@@ -52,7 +52,7 @@ def test_torques_equal_robosuites_in_the_same_state(stock, robot, seed):
     stock_robot = stock.robots[0]
     controller = stock_robot.part_controllers["right"]
     worst = 0.0
-    for action in np.random.default_rng(seed).uniform(-1, 1, (60, 7)):
+    for action in np.random.default_rng(seed).uniform(-1, 1, (40, 7)):
         stock.step(action * [1, 1, 0.3, 1, 1, 1, 1])
         copy_state(stock, model, data)
         stock.sim.step1()
@@ -68,7 +68,7 @@ def test_torques_equal_robosuites_in_the_same_state(stock, robot, seed):
     assert worst < 1e-9
 
 
-@pytest.mark.parametrize(("seed", "actions"), [(0, 200), (1, 50), (2, 50)])
+@pytest.mark.parametrize(("seed", "actions"), [(0, 120), (1, 50), (2, 50)])
 def test_trajectory_equals_robosuites_over_random_actions(stock, robot, seed, actions, monkeypatch):
     control, model, data = ours_like(stock, robot)
     # Half the range, and up a little, so that the arm stays in free space: contacts and joint limits amplify the last bit. Those within a gripper of

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from osel_sim.analysis.cross_fit import Rows, cross_fit
 from osel_sim.analysis.log import Array, LoggedOutcomes, mean_over_repeats
+from osel_sim.analysis.remembered import Remembered
 from osel_sim.analysis.routers import BY_TEXT, MODELS, SHRINK, SINGLE, TEXT, Router, group_numbers, routers
 from osel_sim.core.errors import DataError
 from osel_sim.selection.reward import RewardWeights
@@ -50,8 +51,15 @@ class Oracles:
         return "predictable" if self.expected is None else "expected"
 
 
+_remembered = Remembered[Oracles]()
+
+
 def oracles(log: LoggedOutcomes, weights: RewardWeights) -> Oracles:
     """Compute them over complete instances (`osel_sim.analysis.streams.complete_instances`)."""
+    return _remembered(log, weights, lambda: _oracles(log, weights))
+
+
+def _oracles(log: LoggedOutcomes, weights: RewardWeights) -> Oracles:
     rewards = log.rewards(weights)
     means = mean_over_repeats(rewards)
     if not len(means) or not np.isfinite(means).all():

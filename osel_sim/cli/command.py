@@ -81,7 +81,7 @@ class Command[Config: Settings]:
             default_parameter=Parameter(negative="", consume_multiple=True, allow_repeating=True),
         )
         app["--help"].group = _group(OTHER)
-        app.default(self._function())
+        app.default(self._function)
         return app
 
     def _run(self, arguments: Sequence[str] | None) -> int:
@@ -112,6 +112,7 @@ class Command[Config: Settings]:
         last = {name: index for index, name in enumerate(names)}
         return [word for index, (name, part) in enumerate(zip(names, kept, strict=True)) if name in ADDING or last[name] == index for word in part]
 
+    @functools.cached_property
     def _function(self) -> Callable[..., int]:
         signature = inspect.Signature([*self._parameters()])
 

@@ -1,6 +1,7 @@
 """Docstrings of a class's fields: the string that stands below each."""
 
 import ast
+import functools
 import inspect
 import textwrap
 from dataclasses import is_dataclass
@@ -20,6 +21,7 @@ def field_docstrings(cls: type) -> dict[str, str]:
     return found
 
 
+@functools.cache
 def _own(cls: type) -> dict[str, str]:
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))

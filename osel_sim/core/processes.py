@@ -1,9 +1,9 @@
 """A supervised pool of worker processes: work goes on when a worker dies, and no worker outlives the process that started it.
 
-Workers are fresh interpreters (a forked GL context, torch or numba is a crash waiting to happen) on a socket of their own, not `multiprocessing`
-processes, for two reasons. Those import the caller's main module and unpickle their work before any code of ours runs, and for these seconds do not
-notice that their parent was killed; here the first thing there is is a thread that waits for the end of the socket. And they only work in scripts
-that have `if __name__ == "__main__"`.
+Workers are fresh interpreters, or forked from one that only imports (a forked GL context or thread pool is a crash waiting to happen), on a socket of
+their own. They are not `multiprocessing` processes, for two reasons. Those import the caller's main module and unpickle their work before any code of
+ours runs, and for these seconds do not notice that their parent was killed; here the first thing there is is a thread that waits for the end of the
+socket. And they only work in scripts that have `if __name__ == "__main__"`.
 """
 
 import contextlib
@@ -21,6 +21,7 @@ from typing import Any
 import cloudpickle  # type: ignore[import-untyped]
 
 from osel_sim.core.errors import WorkerError
+from osel_sim.core.fork_server import Forked, fork
 from osel_sim.core.worker import Raised, Ready, Value
 
 STARTS = 3
@@ -62,7 +63,12 @@ class Lost[J]:
 
 
 def run_jobs[J, R](
-    setup: Setup[J, R], jobs: Sequence[J], workers: int, results: Callable[[J], int] = lambda job: 1, ready: Callable[[], None] = lambda: None
+    setup: Setup[J, R],
+    jobs: Sequence[J],
+    workers: int,
+    results: Callable[[J], int] = lambda job: 1,
+    ready: Callable[[], None] = lambda: None,
+    imports: Sequence[str] = (),
 ) -> Generator[Result[J, R] | Lost[J], None, None]:
     """Work on jobs in worker processes. What comes of them does not depend on how many there are, only the order does.
 
@@ -73,6 +79,8 @@ def run_jobs[J, R](
         workers: at most so many processes.
         results: how many results a job has.
         ready: called when the first worker is set up.
+        imports: modules that setup and jobs need and that are long in coming. They are imported once for all workers, in a process from which these
+            are forked: to import them must start no thread and draw nothing. Without them, each worker is a fresh interpreter.
 
     Yields:
         all results of all jobs, those of one job in order; `Lost` where there is none.
@@ -81,7 +89,7 @@ def run_jobs[J, R](
         Exception: `setup` raised it before any worker was ready.
         WorkerError: three jobs in a row lost a result, or no worker starts.
     """
-    with closing(Pool[J, R](setup, min(workers, len(jobs)), ready)) as pool:
+    with closing(Pool[J, R](setup, min(workers, len(jobs)), ready, imports)) as pool:
         for job in jobs:
             pool.add(job, results(job))
         yield from pool.work()
@@ -108,11 +116,12 @@ class _Task[J]:
 class _Worker:
     """A place for a worker process. `connection` is None while there is none."""
 
-    def __init__(self) -> None:
+    def __init__(self, imports: Sequence[str]) -> None:
         self.task: _Task[Any] | None = None
         self.ready, self.failed_starts = False, 0
         self.connection: Connection | None = None
-        self._process: subprocess.Popen[bytes] | None = None
+        self._imports = imports
+        self._process: subprocess.Popen[bytes] | Forked | None = None
 
     @property
     def startable(self) -> bool:
@@ -121,10 +130,13 @@ class _Worker:
     def start(self, setup: bytes) -> None:
         """Start a process. It says when it is ready."""
         connection, theirs = Pipe()
-        arguments = [sys.executable, "-c", _BOOT, str(theirs.fileno()), json.dumps([str(folder) for folder in sys.path])]
         with theirs:
-            # A session of its own: Ctrl-C is for this process, which ends its workers.
-            self._process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()], start_new_session=True)
+            # Either way in a session of its own: Ctrl-C is for this process, which ends its workers.
+            if self._imports and sys.platform == "linux":  # elsewhere system libraries do not stand being forked
+                self._process = fork(theirs.fileno(), self._imports)
+            else:
+                arguments = [sys.executable, "-c", _BOOT, str(theirs.fileno()), json.dumps([str(folder) for folder in sys.path])]
+                self._process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, pass_fds=[theirs.fileno()], start_new_session=True)
         self.connection, self.ready = connection, False
         self.send(setup)
 
@@ -154,14 +166,14 @@ class Pool[J, R]:
     """Worker processes for jobs of which not all are known beforehand; `run_jobs` says the rest. Close it to end them.
 
     Args:
-        setup, ready: as `run_jobs` has them.
+        setup, ready, imports: as `run_jobs` has them.
         workers: at most so many processes.
     """
 
-    def __init__(self, setup: Setup[J, R], workers: int, ready: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, setup: Setup[J, R], workers: int, ready: Callable[[], None] = lambda: None, imports: Sequence[str] = ()) -> None:
         self._ready = ready
         self._setup, self._todo, self._unfinished = cloudpickle.dumps(setup), deque[_Task[J]](), 0
-        self._workers = [_Worker() for _ in range(workers)]
+        self._workers = [_Worker(imports) for _ in range(workers)]
         self._begun = False  # some worker was ready once
         self._losses = 0
 

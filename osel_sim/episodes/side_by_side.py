@@ -16,6 +16,7 @@ from osel_sim.core.processes import Lost, Pool
 from osel_sim.episodes.live import LiveRun
 from osel_sim.episodes.played import Played
 from osel_sim.episodes.robot_workers import Equipment, Look, Play, Seen, equipped
+from osel_sim.episodes.worker_imports import worker_imports
 from osel_sim.interface.instance import Instance
 from osel_sim.interface.selector import Choice
 from osel_sim.interface.suite import Prepares
@@ -47,7 +48,8 @@ class SideBySide:
             for suite in {id(task.suite): task.suite for task in self.equipment.tasks}.values():
                 if isinstance(suite, Prepares):
                     suite.prepare()  # here, once, rather than in every worker
-            with closing(Pool(partial(equipped, self.equipment), min(self.workers, run.options.robots))) as pool:
+            workers, imports = min(self.workers, run.options.robots), worker_imports(self.equipment.tasks, torch=True)
+            with closing(Pool(partial(equipped, self.equipment), workers, imports=imports)) as pool:
                 _Decisions(run, pool, decisions).make(stop)
 
 

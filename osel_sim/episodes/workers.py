@@ -11,10 +11,12 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from osel_sim.context.names import DEFAULT_ENCODER
 from osel_sim.core.errors import WorkerError
 from osel_sim.core.processes import Result, Work, run_jobs
 from osel_sim.episodes.moments import Cuts, MomentRunner, Moments
 from osel_sim.episodes.shard import Shard
+from osel_sim.episodes.worker_imports import worker_imports
 from osel_sim.formats.policy_file import PolicySpec
 from osel_sim.formats.rollout_log import Row
 from osel_sim.interface.instance import Instance
@@ -135,7 +137,8 @@ def record(
     for suite in {id(task.suite): task.suite for task in plan.tasks}.values():
         if isinstance(suite, Prepares):
             suite.prepare()  # here, once, rather than in every worker
-    with closing(run_jobs(functools.partial(_recorder, plan), jobs, workers, lambda job: 1 + len(job.episodes))) as events:
+    imports = worker_imports(plan.tasks, torch=plan.encoder == DEFAULT_ENCODER)
+    with closing(run_jobs(functools.partial(_recorder, plan), jobs, workers, lambda job: 1 + len(job.episodes), imports=imports)) as events:
         for number, event in enumerate(events):
             if number == 0:
                 begun()

@@ -174,7 +174,7 @@ def to_images(figure: Figure) -> dict[str, bytes]:
     import vl_convert
 
     # Nothing in a specification names an address; none could be reached.
-    svg = _renumbered(vl_convert.vegalite_to_svg(figure.spec, allowed_base_urls=[]))
+    svg = _clipped_once(_renumbered(vl_convert.vegalite_to_svg(figure.spec, allowed_base_urls=[])))
     return {"svg": svg.encode(), "png": vl_convert.svg_to_png(svg, scale=_SCALE)}
 
 
@@ -182,6 +182,15 @@ def _renumbered(svg: str) -> str:
     """Clip paths numbered from 0: Vega goes on counting from one picture to the next, and the same picture would not be the same bytes."""
     numbers: dict[str, str] = {}
     return re.sub(r'(id="|="url\(#)(clip\d+)', lambda found: found[1] + numbers.setdefault(found[2], f"clip{len(numbers)}"), svg)
+
+
+def _clipped_once(svg: str) -> str:
+    """Lines of one layer cut off together, not each by itself: each cut takes a picture of its own, which is most of the time that a PNG takes."""
+    for layer in dict.fromkeys(re.findall(r'"mark-group role-scope (\w+)_pathgroup"', svg)):
+        if clips := re.findall(rf'{layer}_marks" (clip-path="[^"]+")', svg):  # all of them the panel's rectangle
+            svg = re.sub(rf'({layer}_marks") clip-path="[^"]+"', r"\1", svg)
+            svg = svg.replace(f'{layer}_pathgroup"', f'{layer}_pathgroup" {clips[0]}')
+    return svg
 
 
 def numbers(values: ArrayLike, digits: int = 4) -> list[float | None]:
